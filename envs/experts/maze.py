@@ -1,0 +1,159 @@
+"""Demonstrators of MazeRunner: "A*-n" and "Random" (paper, appendices B.3 and C.1).
+
+Both know only what their four rays have shown them. A*-n visits n random goals: a goal on the known
+map is approached on the shortest known path; otherwise the demonstrator walks to the seen but
+unvisited cell that minimizes G + H, the known path to it plus its Manhattan distance to the goal. It
+chooses anew on arrival and whenever a goal is reached; ties go to the cell nearest to the goal. Random walks to one of the five nearest seen
+but unvisited cells.
+
+Known maps are bitboards (``envs.bitboard``). The path to the chosen cell is re-read from the known map
+at every step, so that a shortcut seen on the way is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from envs.base import Agent, Demonstrator, TimeStep
+from envs.bitboard import distances, toward
+from envs.maze_runner import (
+    GOAL_REWARD,
+    MOVES,
+    STAY,
+    STEP_PENALTY,
+    MazeRunner,
+    MazeState,
+    MazeTask,
+    cells_in_sight,
+    generate_maze,
+)
+
+FAR = 1 << 30
+NUM_NEAREST = 5  # Random chooses among this many cells
+MIN_LENGTH = 20  # shorter demonstrations are dropped
+
+
+class Memory(NamedTuple):
+    """What a demonstrator remembers within an episode."""
+
+    seen: Bool[Array, "S S"]
+    """Free cells seen so far, the visited ones included."""
+    visited: Bool[Array, "S S"]
+    goals: Int[Array, "N 2"]
+    num_reached: Int[Array, ""]
+    target: Int[Array, "2"]
+    """The cell it is walking to."""
+
+
+# (key, memory, steps to every known cell) -> the next cell to walk to, whether there is none
+ChooseTarget = Callable[[PRNGKeyArray, Memory, Array], tuple[Array, Array]]
+
+
+def astar(env: MazeRunner, num_goals: int) -> Agent:
+    """The A*-n demonstrator with n = ``num_goals`` goals; it quits when all are reached."""
+
+    def choose(key: PRNGKeyArray, memory: Memory, steps: Array) -> tuple[Array, Array]:
+        del key
+        side = env.side
+        goal = memory.goals[jnp.minimum(memory.num_reached, num_goals - 1)]
+        index = jnp.arange(side)
+        manhattan = abs(index - goal[0])[:, None] + abs(index - goal[1])[None, :]
+        # Among cells of equal G + H the one nearest to the goal.
+        score = (steps + manhattan) * side**2 + manhattan
+        cell = jnp.argmin(jnp.where(_frontier(memory, steps), score, FAR))
+        frontier_cell = jnp.stack([cell // side, cell % side])
+        target = jnp.where(memory.seen[tuple(goal)], goal, frontier_cell)
+        return target, memory.num_reached >= num_goals
+
+    return _explorer(env, num_goals, choose)
+
+
+def random_walk(env: MazeRunner) -> Agent:
+    """The Random demonstrator; it quits when nothing is left to visit."""
+
+    def choose(key: PRNGKeyArray, memory: Memory, steps: Array) -> tuple[Array, Array]:
+        frontier = _frontier(memory, steps)
+        nearness, cells = jax.lax.top_k(jnp.where(frontier, -steps, -FAR).ravel(), NUM_NEAREST)
+        rank = jax.random.randint(key, (), 0, jnp.maximum(jnp.sum(nearness > -FAR), 1))
+        return jnp.stack([cells[rank] // env.side, cells[rank] % env.side]), ~jnp.any(frontier)
+
+    return _explorer(env, 0, choose)
+
+
+def _frontier(memory: Memory, steps: Array) -> Bool[Array, "S S"]:
+    return memory.seen & ~memory.visited & (steps >= 0)
+
+
+def _explorer(env: MazeRunner, num_goals: int, choose: ChooseTarget) -> Agent:
+    """An agent that walks from target to target over what it has seen."""
+    side = env.side
+
+    def draw_goals(key: PRNGKeyArray, task: MazeTask) -> Int[Array, "N 2"]:
+        weight = (task.maze == 0).at[env.start].set(False).ravel()
+        scores = jnp.where(weight, jax.random.uniform(key, (side * side,)), -1.0)
+        _, cells = jax.lax.top_k(scores, num_goals)
+        return jnp.stack([cells // side, cells % side], axis=1)
+
+    def begin(
+        key: PRNGKeyArray, task: MazeTask, state: MazeState, timestep: TimeStep
+    ) -> tuple[Array, Array, Memory]:
+        key_goals, key_choose = jax.random.split(key)
+        nowhere = jnp.zeros((side, side), bool)
+        goals = draw_goals(key_goals, task)
+        memory = Memory(nowhere, nowhere, goals, jnp.zeros((), jnp.int32), state.position)
+        return proceed(key_choose, memory, state, timestep)
+
+    def proceed(
+        key: PRNGKeyArray, memory: Memory, state: MazeState, timestep: TimeStep
+    ) -> tuple[Array, Array, Memory]:
+        del timestep  # the rays below are its observation, as cells
+        position = state.position
+        visited = memory.visited.at[tuple(position)].set(True)
+        seen = memory.seen | cells_in_sight(state.task.maze, position)
+        memory = memory._replace(seen=seen, visited=visited)
+
+        arrived = jnp.all(position == memory.target)
+        if num_goals:
+            goal = memory.goals[jnp.minimum(memory.num_reached, num_goals - 1)]
+            reached = jnp.all(position == goal) & (memory.num_reached < num_goals)
+            memory = memory._replace(num_reached=memory.num_reached + reached)
+            arrived |= reached
+        chosen, quits = choose(key, memory, distances(seen, position))
+        target = jnp.where(arrived, chosen, memory.target)
+
+        neighbors = position + jnp.asarray(MOVES[:4])
+        leads_on = toward(seen, position, target)[neighbors[:, 0], neighbors[:, 1]]
+        action = jnp.where(jnp.any(leads_on), jnp.argmax(leads_on), STAY)
+        return action, quits, memory._replace(target=target)
+
+    return Agent(begin, proceed)
+
+
+def first_hit_return(trajectory: Any) -> Float[Array, ""]:
+    """The return of a trajectory on the task whose goal is where the trajectory ends."""
+    arrived = jnp.all(trajectory.goals == trajectory.goals[trajectory.length - 1], axis=-1)
+    return GOAL_REWARD - STEP_PENALTY * (1 + jnp.argmax(arrived))
+
+
+def maze_demonstrators(env: MazeRunner) -> dict[str, Demonstrator]:
+    """The datasets of Table 5 by name."""
+
+    def endless_task(key: PRNGKeyArray) -> MazeTask:
+        """A random maze whose goal is a wall, so that only the demonstrator ends the episode."""
+        return MazeTask(generate_maze(key, env.side), jnp.zeros(2, jnp.int32))
+
+    agents = {
+        "astar1": astar(env, 1),
+        "astar2": astar(env, 2),
+        "astar4": astar(env, 4),
+        "random": random_walk(env),
+    }
+    return {
+        name: Demonstrator(endless_task, agent, MIN_LENGTH, first_hit_return)
+        for name, agent in agents.items()
+    }

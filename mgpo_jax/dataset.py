@@ -1,0 +1,223 @@
+"""Trajectories on disk and in memory, and the batches that pre-training draws from them.
+
+On disk a dataset is a folder with ``trajectories.npz`` (ragged arrays concatenated over time, with the
+length of each trajectory) and ``manifest.json`` (what it is, how it was made, its hash).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from envs.base import EnvSpec
+from mgpo_jax.errors import DataError
+from mgpo_jax.types import Trajectory
+
+FORMAT = 1
+ARRAYS = "trajectories.npz"
+MANIFEST = "manifest.json"
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """N trajectories, concatenated over time; trajectory ``i`` is ``steps[starts[i]:][:lengths[i]]``."""
+
+    obs: np.ndarray  # [total, D] float32
+    actions: np.ndarray  # [total] int32, or [total, A] float32
+    goals: np.ndarray  # [total, G] float32
+    goal_reached: np.ndarray  # [total] bool
+    outcomes: np.ndarray  # [total, G] float32
+    lengths: np.ndarray  # [N] int32
+    task_hashes: np.ndarray  # [N] uint64, of ``Environment.fingerprint``
+
+    @property
+    def starts(self) -> np.ndarray:
+        return np.concatenate([[0], np.cumsum(self.lengths[:-1])])
+
+    def __len__(self) -> int:
+        return len(self.lengths)
+
+    def slice(self, begin: int, end: int) -> Dataset:
+        """Trajectories ``begin`` to ``end``, as a view."""
+        first = int(self.lengths[:begin].sum())
+        last = int(self.lengths[:end].sum())
+        step_arrays = {name: getattr(self, name)[first:last] for name in Trajectory._fields[:-1]}
+        return Dataset(
+            lengths=self.lengths[begin:end], task_hashes=self.task_hashes[begin:end], **step_arrays
+        )
+
+    def gather(self, indices: np.ndarray, lengths: np.ndarray, num_steps: int) -> Trajectory:
+        """The first ``lengths`` steps of some trajectories, padded with zeros: ``[B, num_steps, ..]``."""
+        time = np.arange(num_steps)
+        real = time < lengths[:, None]
+        rows = np.where(real, self.starts[indices][:, None] + time, 0)
+
+        def padded(steps: np.ndarray) -> np.ndarray:
+            mask = real.reshape(real.shape + (1,) * (steps.ndim - 1))
+            return np.where(mask, steps[rows], np.zeros((), steps.dtype))
+
+        arrays = [padded(getattr(self, name)) for name in Trajectory._fields[:-1]]
+        return Trajectory(*arrays, length=lengths.astype(np.int32))
+
+
+def hash_task(fingerprint: np.ndarray) -> np.uint64:
+    """A 64-bit hash of one task's fingerprint."""
+    digest = hashlib.blake2b(np.ascontiguousarray(fingerprint, np.int32).tobytes(), digest_size=8)
+    return np.frombuffer(digest.digest(), np.uint64)[0]
+
+
+def hash_file(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def save_dataset(folder: Path, dataset: Dataset, manifest: dict[str, Any]) -> None:
+    """Write a dataset; the folder appears only when it is complete."""
+    folder = Path(folder)
+    if folder.exists():
+        raise DataError(f"{folder} exists already; remove it or choose another place with --out")
+    partial = folder.with_name(f"{folder.name}.partial-{os.getpid()}")
+    partial.mkdir(parents=True)
+    np.savez_compressed(partial / ARRAYS, allow_pickle=False, **vars(dataset))
+    manifest = {
+        "format": FORMAT,
+        "sha256": hash_file(partial / ARRAYS),
+        "num_trajectories": len(dataset),
+        "num_steps": int(dataset.lengths.sum()),
+        **manifest,
+    }
+    (partial / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n")
+    partial.rename(folder)
+
+
+def load_dataset(folder: Path, spec: EnvSpec | None = None) -> tuple[Dataset, dict[str, Any]]:
+    """Read a dataset and its manifest.
+
+    Args:
+      folder: where ``save_dataset`` wrote it.
+      spec: the world it must fit.
+
+    Raises:
+      DataError: if it is missing, damaged, holds NaN or belongs to another world.
+    """
+    folder = Path(folder)
+    remake = f"remove {folder} and collect it again"
+    if not (folder / MANIFEST).is_file():
+        raise DataError(f"no dataset in {folder} ({MANIFEST} is missing)")
+    try:
+        manifest = json.loads((folder / MANIFEST).read_text())
+    except ValueError:
+        raise DataError(f"{folder / MANIFEST} is not readable JSON; {remake}") from None
+    if manifest.get("format") != FORMAT:
+        raise DataError(
+            f"{folder} has format {manifest.get('format')}, this version reads {FORMAT}"
+        )
+    path = folder / ARRAYS
+    if not path.is_file() or hash_file(path) != manifest.get("sha256"):
+        raise DataError(f"{path} is missing or differs from the hash in its manifest; {remake}")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            dataset = Dataset(**file)
+    except (OSError, ValueError, TypeError, KeyError, zipfile.BadZipFile):
+        raise DataError(f"{path} does not hold the arrays of a dataset; {remake}") from None
+    check_dataset(dataset, path, spec)
+    return dataset, manifest
+
+
+def check_dataset(dataset: Dataset, where: Path | str, spec: EnvSpec | None = None) -> None:
+    """Raise ``DataError`` with the first thing that is wrong with a dataset."""
+    total = int(dataset.lengths.sum())
+    if len(dataset) == 0 or dataset.lengths.min() < 1:
+        raise DataError(f"{where}: every trajectory needs at least one step")
+    for name in Trajectory._fields[:-1]:
+        array = getattr(dataset, name)
+        if len(array) != total:
+            raise DataError(
+                f"{where}: {name} has {len(array)} steps, the lengths add up to {total}"
+            )
+        if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
+            step = int(np.argwhere(~np.isfinite(array))[0][0])
+            raise DataError(f"{where}: {name} holds NaN or infinity, first at step {step}")
+    if spec is None:
+        return
+    expected: dict[str, tuple[tuple[int, ...], Any]] = {
+        "obs": ((spec.obs_dim,), np.floating),
+        "actions": ((), np.integer) if spec.discrete else ((spec.action_dim,), np.floating),
+        "goals": ((spec.goal_dim,), np.floating),
+        "goal_reached": ((), np.bool_),
+        "outcomes": ((spec.goal_dim,), np.floating),
+    }
+    for name, (shape, kind) in expected.items():
+        array = getattr(dataset, name)
+        if array.shape[1:] != shape or not np.issubdtype(array.dtype, kind):
+            raise DataError(
+                f"{where}: {name} is {array.dtype}{list(array.shape[1:])} a step, "
+                f"{spec.name} needs {kind.__name__}{list(shape)}"
+            )
+    if spec.discrete and not (
+        0 <= dataset.actions.min() <= dataset.actions.max() < spec.action_dim
+    ):
+        raise DataError(f"{where}: actions must lie in 0..{spec.action_dim - 1}")
+    if dataset.lengths.max() > spec.horizon:
+        raise DataError(
+            f"{where}: a trajectory has {dataset.lengths.max()} steps, "
+            f"the horizon of {spec.name} is {spec.horizon}"
+        )
+
+
+class BatchPlan(NamedTuple):
+    """One part of a batch: which trajectories, cut at which length, padded to how many steps."""
+
+    indices: np.ndarray
+    lengths: np.ndarray
+    num_steps: int
+
+
+def plan_batches(
+    dataset: Dataset,
+    *,
+    seed: int,
+    batch_size: int,
+    part_size: int,
+    bucket: int,
+    truncate: bool,
+    first_step: int = 0,
+    pool_steps: int = 16,
+) -> Iterator[list[BatchPlan]]:
+    """Batches of ``batch_size`` trajectories, in parts of ``part_size`` of nearly equal length.
+
+    Trajectories are drawn uniformly with replacement and, with ``truncate``, cut at a uniformly
+    random step (appendix D). The draws of ``pool_steps`` batches are sorted by length, cut into
+    parts and the parts shuffled, so that little padding is computed and yet every batch is a mix of
+    all lengths. Part lengths are rounded up to multiples of ``bucket`` to bound the number of shapes.
+
+    The stream is a function of the seed alone: starting at ``first_step`` skips exactly the batches
+    before it.
+    """
+    if batch_size % part_size:
+        raise ValueError(f"batch_size {batch_size} is not a multiple of part_size {part_size}")
+    parts_per_batch = batch_size // part_size
+    longest = int(dataset.lengths.max())
+    pool_index, offset = divmod(first_step, pool_steps)
+    while True:
+        rng = np.random.Generator(np.random.Philox(key=[seed, pool_index]))
+        indices = rng.integers(len(dataset), size=pool_steps * batch_size)
+        lengths = dataset.lengths[indices]
+        if truncate:
+            lengths = rng.integers(1, lengths + 1)
+        order = np.argsort(lengths, kind="stable").reshape(-1, part_size)
+        parts = []
+        for rows in order[rng.permutation(len(order))]:
+            num_steps = min(-(-int(lengths[rows].max()) // bucket) * bucket, longest)
+            parts.append(BatchPlan(indices[rows], lengths[rows], num_steps))
+        for step in range(offset, pool_steps):
+            yield parts[step * parts_per_batch : (step + 1) * parts_per_batch]
+        pool_index, offset = pool_index + 1, 0

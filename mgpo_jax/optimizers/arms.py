@@ -1,0 +1,153 @@
+"""The table of prompts under trial, and Algorithm 1 around it (paper, section 3.2, appendix E.1).
+
+UCB, BPE and the explore ablation differ only in which prompt they act with next; ``bandit`` is the
+rest. After the first episode, which evaluates (g^M) greedily, episodes alternate: one samples actions
+under the chosen prompt, the next evaluates greedily a new prompt drawn from the best trajectory so far.
+The new prompt becomes an arm if its return beats the best mean of the table.
+
+As in the authors' code the chosen prompt acts by sampling, new prompts are evaluated greedily, and
+among trajectories of equal return the newest counts as the best. Unlike it, an arm is inserted when it
+beats the best *mean* (as the paper has it), and the first evaluation counts as an episode.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from mgpo_jax.optimizers.base import PromptOptimizer, SearchSpace, choose
+from mgpo_jax.prompts import sample_prompt, single_goal
+from mgpo_jax.types import Episode, PRNGKeyArray, Prompt, Query, Trajectory
+
+MAX_ARMS = 64
+
+
+class Arms(NamedTuple):
+    """M prompts with their return statistics; rows from ``size`` on are free."""
+
+    prompts: Prompt
+    count: Float[Array, "M"]
+    mean: Float[Array, "M"]
+    sum_sq: Float[Array, "M"]
+    """Sum of squared deviations from the mean (Welford)."""
+    greedy_return: Float[Array, "M"]
+    """Return of the greedy evaluation that made the prompt an arm."""
+    size: Int[Array, ""]
+
+    @property
+    def taken(self) -> Bool[Array, "M"]:
+        return jnp.arange(len(self.count)) < self.size
+
+    @property
+    def std(self) -> Float[Array, "M"]:
+        """Population standard deviation of each arm's returns."""
+        return jnp.sqrt(self.sum_sq / jnp.maximum(self.count, 1))
+
+    def prompt(self, arm: Int[Array, ""]) -> Prompt:
+        return jax.tree.map(lambda rows: rows[arm], self.prompts)
+
+
+def empty_arms(num_arms: int, num_slots: int, goal_dim: int) -> Arms:
+    prompts = Prompt(
+        jnp.zeros((num_arms, num_slots, goal_dim)), jnp.zeros((num_arms, num_slots), bool)
+    )
+    zeros = jnp.zeros(num_arms)
+    return Arms(prompts, zeros, zeros, zeros, jnp.full(num_arms, -jnp.inf), jnp.int32(0))
+
+
+def insert_arm(arms: Arms, prompt: Prompt, return_: Float[Array, ""]) -> Arms:
+    """A new arm with history {return_}; in a full table it replaces the worst greedy return."""
+    worst = jnp.argmin(jnp.where(arms.taken, arms.greedy_return, jnp.inf))
+    row = jnp.where(arms.size < len(arms.count), arms.size, worst)
+    return Arms(
+        prompts=jax.tree.map(lambda rows, new: rows.at[row].set(new), arms.prompts, prompt),
+        count=arms.count.at[row].set(1.0),
+        mean=arms.mean.at[row].set(return_),
+        sum_sq=arms.sum_sq.at[row].set(0.0),
+        greedy_return=arms.greedy_return.at[row].set(return_),
+        size=jnp.minimum(arms.size + 1, len(arms.count)),
+    )
+
+
+def update_arm(arms: Arms, arm: Int[Array, ""], return_: Float[Array, ""]) -> Arms:
+    """Add one return to the history of an arm."""
+    count = arms.count[arm] + 1
+    delta = return_ - arms.mean[arm]
+    mean = arms.mean[arm] + delta / count
+    return arms._replace(
+        count=arms.count.at[arm].set(count),
+        mean=arms.mean.at[arm].set(mean),
+        sum_sq=arms.sum_sq.at[arm].add(delta * (return_ - mean)),
+    )
+
+
+class BanditState(NamedTuple):
+    """Algorithm 1 between two episodes."""
+
+    task_goal: Float[Array, "G"]
+    arms: Arms
+    episode: Int[Array, ""]
+    """Episodes told so far."""
+    arm: Int[Array, ""]
+    """The arm last chosen."""
+    newest: Prompt
+    """The prompt last drawn from the best trajectory."""
+    best_return: Float[Array, ""]
+    """R*."""
+    best_trajectory: Trajectory
+    """tau*; blank before the first episode."""
+
+
+Select = Callable[[PRNGKeyArray, BanditState], Int[Array, ""]]
+
+
+def bandit(space: SearchSpace, select: Select, act_with_newest: bool = False) -> PromptOptimizer:
+    """Algorithm 1 with ``select(key, state) -> arm``.
+
+    ``act_with_newest`` acts with the prompt last drawn, arm or not (the explore ablation).
+    """
+    num_arms = min(MAX_ARMS, 1 + space.num_episodes // 2)
+
+    def init(key: PRNGKeyArray, task_goal: Float[Array, "G"], blank: Trajectory) -> BanditState:
+        del key
+        arms = empty_arms(num_arms, space.num_slots, task_goal.shape[-1])
+        first = single_goal(task_goal, space.num_slots)
+        zero = jnp.int32(0)
+        return BanditState(task_goal, arms, zero, zero, first, jnp.float32(-jnp.inf), blank)
+
+    def ask(key: PRNGKeyArray, state: BanditState) -> tuple[Query, BanditState]:
+        key_select, key_prompt = jax.random.split(key)
+        acts = state.episode % 2 == 1
+        arm = select(key_select, state)
+        chosen = state.newest if act_with_newest else state.arms.prompt(arm)
+        drawn = sample_prompt(
+            key_prompt, state.best_trajectory, state.task_goal, space.num_slots, space.max_goals
+        )
+        keeps = acts | (state.episode == 0)
+        newest = choose(keeps, state.newest, drawn)
+        prompt = choose(acts, chosen, newest)
+        return Query(prompt, ~acts), state._replace(arm=arm, newest=newest)
+
+    def tell(state: BanditState, query: Query, episode: Episode) -> BanditState:
+        return_ = episode.return_
+        best_mean = jnp.max(jnp.where(state.arms.taken, state.arms.mean, -jnp.inf))
+        inserts = query.greedy & (return_ > best_mean)
+        sampled = ~query.greedy & (not act_with_newest)
+        inserted = insert_arm(state.arms, query.prompt, return_)
+        updated = update_arm(state.arms, state.arm, return_)
+        improves = return_ >= state.best_return
+        return state._replace(
+            arms=choose(inserts, inserted, choose(sampled, updated, state.arms)),
+            episode=state.episode + 1,
+            best_return=jnp.maximum(return_, state.best_return),
+            best_trajectory=choose(improves, episode.trajectory, state.best_trajectory),
+        )
+
+    def best(state: BanditState) -> Prompt:
+        return state.arms.prompt(jnp.argmax(state.arms.greedy_return))
+
+    return PromptOptimizer(init, ask, tell, best)

@@ -1,0 +1,23 @@
+"""MGPO-explore: the ablation without a bandit (paper, section 4.3).
+
+Acts with the prompt most recently drawn from the best trajectory, whatever its returns were.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from mgpo_jax.optimizers.arms import BanditState, bandit
+from mgpo_jax.optimizers.base import PromptOptimizer, SearchSpace
+from mgpo_jax.types import PRNGKeyArray
+
+
+def explore(space: SearchSpace) -> PromptOptimizer:
+    """Algorithm 1 without prompt selection."""
+
+    def select(key: PRNGKeyArray, state: BanditState) -> Int[Array, ""]:
+        del key, state
+        return jnp.int32(0)
+
+    return bandit(space, select, act_with_newest=True)

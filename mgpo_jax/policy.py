@@ -1,0 +1,37 @@
+"""What a rollout needs of a policy, and how the Transformer provides it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from mgpo_jax.transformer import GoalTransformer, TransformerConfig, grow_cache
+
+
+class Policy(NamedTuple):
+    """Acts step by step from a prompt; both functions are for one episode and are pure."""
+
+    prefill: Callable
+    """``(prompt, obs) -> (action distribution, carry)`` at the first observation."""
+    decode: Callable
+    """``(carry, action, obs) -> (action distribution, carry)`` after every step."""
+    grow: Callable
+    """``(carry, num_steps) -> carry`` with room for that many more decodes."""
+    num_slots: int
+    """P: slots of the prompts it takes, its longest prompt."""
+
+
+def transformer_policy(config: TransformerConfig, params: Any) -> Policy:
+    """The pre-trained multi-goal Transformer as a policy; the carry is its KV cache."""
+    network = GoalTransformer(config)
+
+    def prefill(prompt: Any, obs: Any) -> Any:
+        return network.apply(params, prompt, obs, method="prefill")
+
+    def decode(carry: Any, action: Any, obs: Any) -> Any:
+        return network.apply(params, carry, action, obs, method="decode")
+
+    def grow(cache: Any, num_steps: int) -> Any:
+        return grow_cache(cache, 2 * num_steps)
+
+    return Policy(prefill, decode, grow, config.max_prompt_length)

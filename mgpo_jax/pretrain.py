@@ -1,0 +1,234 @@
+"""Pre-training: behavior cloning with hindsight multi-goal prompts (paper, section 3.1, Eq. 2).
+
+A gradient step is accumulated over parts of a batch. Each part holds trajectories of nearly equal
+length (little padding), small enough that its activations stay in cache, and divided among the
+devices. Every random draw is a function of the seed and the step number, so that a run continued from
+a checkpoint equals one that was never interrupted, bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.flatten_util import ravel_pytree
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Float
+
+from mgpo_jax.dataset import BatchPlan, Dataset, plan_batches
+from mgpo_jax.prompts import hindsight_outcome, sample_prompt, single_goal
+from mgpo_jax.sharding import AXIS, replicate, split
+from mgpo_jax.transformer import GoalTransformer, TransformerConfig
+from mgpo_jax.types import PRNGKeyArray, Trajectory
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """How to train. Values in brackets are the paper's (Table 6) or, marked *, its code's."""
+
+    steps: int = 24_000
+    """Gradient steps [50,000* for maze15, 200,000* for maze30]."""
+    batch_size: int = 64
+    """Trajectories in a gradient step [64]."""
+    learning_rate: float = 1e-3
+    """Peak learning rate of AdamW [1e-4]."""
+    warmup_steps: int = 300
+    """Steps of linear warm-up [10,000]."""
+    schedule: Literal["cosine", "constant"] = "cosine"
+    """Decay after warm-up: to 2 % along a cosine, or none [constant*]."""
+    weight_decay: float = 1e-4
+    """AdamW weight decay [1e-4]."""
+    clip_norm: float = 1.0
+    """Largest global norm of the gradient [0.25*]."""
+    part_size: int = 16
+    """Trajectories computed at once, over all devices; changes speed and memory, not the sum."""
+    bucket: int = 4
+    """Padded lengths are multiples of this many steps."""
+    seed: int = 0
+    """Seed of initial weights, batches, prompts and dropout."""
+
+
+class TrainState(NamedTuple):
+    """Everything a run carries from one gradient step to the next."""
+
+    params: Any
+    opt_state: Any
+    step: int
+
+
+class Stats(NamedTuple):
+    """Sums over real steps."""
+
+    nll: Float[Array, "*batch"]
+    correct: Float[Array, "*batch"]
+    count: Float[Array, "*batch"]
+
+
+def learning_rate_schedule(config: TrainConfig) -> optax.Schedule:
+    rate, warmup = config.learning_rate, min(config.warmup_steps, config.steps)
+    if config.schedule == "cosine":
+        return optax.warmup_cosine_decay_schedule(0.0, rate, warmup, config.steps, 0.02 * rate)
+    return optax.linear_schedule(0.0, rate, warmup)
+
+
+def make_optimizer(config: TrainConfig) -> optax.GradientTransformation:
+    return optax.chain(
+        optax.clip_by_global_norm(config.clip_norm),
+        optax.adamw(learning_rate_schedule(config), weight_decay=config.weight_decay),
+    )
+
+
+def bc_loss(
+    params: Any,
+    key: PRNGKeyArray,
+    network: GoalTransformer,
+    trajectory: Trajectory,
+    deterministic: bool = False,
+) -> tuple[Float[Array, ""], Stats]:
+    """-sum_t log pi(a_t | p, h_{t-1}, o_t) of one trajectory, with p ~ P(p | tau) (Eq. 2)."""
+    key_prompt, key_dropout = jax.random.split(key)
+    num_slots = network.config.max_prompt_length
+    prompt = sample_prompt(key_prompt, trajectory, hindsight_outcome(trajectory), num_slots)
+    distribution = network.apply(
+        params,
+        prompt,
+        trajectory.obs,
+        trajectory.actions,
+        deterministic or network.config.dropout == 0,
+        rngs={"dropout": key_dropout},
+    )
+    real = jnp.arange(len(trajectory.obs)) < trajectory.length
+    nll = -jnp.sum(jnp.where(real, distribution.log_prob(trajectory.actions), 0.0))
+    hits = distribution.mode() == trajectory.actions
+    hits = jnp.all(hits.reshape(len(real), -1), axis=1)
+    correct = jnp.sum(hits & real).astype(jnp.float32)
+    return nll, Stats(nll, correct, trajectory.length.astype(jnp.float32))
+
+
+class Trainer(NamedTuple):
+    """The jitted pieces of a training run."""
+
+    init: Callable[[], TrainState]
+    step: Callable[[TrainState, list[BatchPlan]], tuple[TrainState, dict[str, Array]]]
+    evaluate: Callable[[Any, list[BatchPlan]], dict[str, float]]
+
+
+def make_trainer(
+    config: TrainConfig, network_config: TransformerConfig, dataset: Dataset, mesh: Mesh
+) -> Trainer:
+    """Build the training program for a dataset on a mesh.
+
+    Raises:
+      ValueError: if the devices do not divide ``config.part_size``.
+    """
+    num_devices = mesh.devices.size
+    if config.part_size % num_devices:
+        raise ValueError(f"part_size {config.part_size} does not divide over {num_devices} devices")
+    home = mesh.devices.flat[0]
+    network = GoalTransformer(network_config)
+    optimizer = make_optimizer(config)
+    key_init, key_steps, key_eval = jax.random.split(jax.random.key(config.seed), 3)
+
+    def init() -> TrainState:
+        first = jax.tree.map(jnp.asarray, dataset.gather(np.array([0]), np.array([1]), 1))
+        one = jax.tree.map(lambda leaf: leaf[0], first)
+        prompt = single_goal(one.outcomes[0], network_config.max_prompt_length)
+        params = network.init(key_init, prompt, one.obs, one.actions)
+        return TrainState(params, optimizer.init(params), 0)
+
+    shapes = jax.eval_shape(init).params
+    _, unravel = ravel_pytree(jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes))
+    flatten = jax.jit(lambda params: ravel_pytree(params)[0])
+
+    def batch_loss(
+        params: Any, keys: PRNGKeyArray, part: Trajectory, deterministic: bool
+    ) -> tuple[Array, Stats]:
+        loss = partial(bc_loss, params, network=network, deterministic=deterministic)
+        nll, stats = jax.vmap(lambda key, one: loss(key, trajectory=one))(keys, part)
+        return nll.sum(), jax.tree.map(jnp.sum, stats)
+
+    @partial(jax.jit, donate_argnums=1)
+    def accumulate(weights: Array, sums: Any, key: PRNGKeyArray, part: Trajectory) -> Any:
+        """Add one part's gradient and stats to ``sums``, a row of which belongs to each device."""
+
+        def on_device(weights: Array, sums: Any, keys: PRNGKeyArray, part: Trajectory) -> Any:
+            grads, stats = jax.grad(batch_loss, has_aux=True)(unravel(weights), keys, part, False)
+            added = (ravel_pytree(grads)[0], stats)
+            return jax.tree.map(lambda row, new: row + new, sums, added)
+
+        spread = PartitionSpec(AXIS)
+        keys = jax.random.split(key, part.length.shape[0])
+        return jax.shard_map(
+            on_device,
+            mesh=mesh,
+            in_specs=(PartitionSpec(), spread, spread, spread),
+            out_specs=spread,
+            check_vma=False,  # gradients stay on their device until the update sums them
+        )(weights, sums, keys, part)
+
+    @partial(jax.jit, donate_argnums=(0, 1))
+    def update(params: Any, opt_state: Any, rows: list[Any]) -> tuple[Any, Any, dict[str, Array]]:
+        flat, stats = jax.tree.map(lambda *of_devices: sum(of_devices)[0], *rows)
+        grads = unravel(flat / stats.count)
+        updates, opt_state = optimizer.update(grads, opt_state, params)
+        metrics = {
+            "loss": stats.nll / stats.count,
+            "accuracy": stats.correct / stats.count,
+            "grad_norm": optax.global_norm(grads),
+            "num_steps": stats.count,
+        }
+        return optax.apply_updates(params, updates), opt_state, metrics
+
+    @partial(jax.jit, static_argnums=0, out_shardings=NamedSharding(mesh, PartitionSpec(AXIS)))
+    def zeros(num_weights: int) -> Any:
+        return jnp.zeros((num_devices, num_weights)), Stats(*jnp.zeros((3, num_devices)))
+
+    @jax.jit
+    def part_stats(params: Any, key: PRNGKeyArray, part: Trajectory) -> Stats:
+        return batch_loss(params, jax.random.split(key, part.length.shape[0]), part, True)[1]
+
+    def step(state: TrainState, plans: list[BatchPlan]) -> tuple[TrainState, dict[str, Array]]:
+        weights = flatten(state.params)
+        sums = zeros(weights.size)
+        weights = replicate(mesh, weights)
+        key = jax.random.fold_in(key_steps, state.step)
+        for index, plan in enumerate(plans):
+            part = split(mesh, dataset.gather(*plan))
+            sums = accumulate(weights, sums, jax.random.fold_in(key, index), part)
+        # Rows travel by plain copies: a collective can deadlock on a CPU's small thread pool.
+        rows = [
+            jax.tree.map(
+                lambda leaf, i=i: jax.device_put(leaf.addressable_shards[i].data, home), sums
+            )
+            for i in range(num_devices)
+        ]
+        params, opt_state, metrics = update(state.params, state.opt_state, rows)
+        return TrainState(params, opt_state, state.step + 1), metrics
+
+    def evaluate(params: Any, plans: list[BatchPlan]) -> dict[str, float]:
+        stats = [part_stats(params, key_eval, dataset.gather(*plan)) for plan in plans]
+        total = jax.tree.map(lambda *leaves: float(sum(leaves)), *stats)
+        return {"loss": total.nll / total.count, "accuracy": total.correct / total.count}
+
+    return Trainer(init, step, evaluate)
+
+
+def batch_stream(
+    config: TrainConfig, dataset: Dataset, truncate: bool, first_step: int = 0
+) -> Iterator[list[BatchPlan]]:
+    """The batches of a run from ``first_step`` on."""
+    return plan_batches(
+        dataset,
+        seed=config.seed,
+        batch_size=config.batch_size,
+        part_size=config.part_size,
+        bucket=config.bucket,
+        truncate=truncate,
+        first_step=first_step,
+    )

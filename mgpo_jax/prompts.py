@@ -1,0 +1,94 @@
+"""The one sampler of goal prompts, p ~ P(p | tau) (paper, section 3.1).
+
+Pre-training relabels the dataset with it in hindsight; adaptation draws new prompts from the best
+trajectory with it. Indices are drawn without replacement and kept in order, the number of goals is
+uniform in 1..K and clipped to the goals available, as in the authors' code.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from mgpo_jax.types import PRNGKeyArray, Prompt, Trajectory
+
+
+def single_goal(goal: Float[Array, "G"], num_slots: int) -> Prompt:
+    """The prompt (g) of one goal in ``num_slots`` slots; (g^M) is where adaptation starts."""
+    goals = jnp.zeros((num_slots, *goal.shape), goal.dtype).at[-1].set(goal)
+    return Prompt(goals, jnp.arange(num_slots) == num_slots - 1)
+
+
+def hindsight_outcome(trajectory: Trajectory) -> Float[Array, "G"]:
+    """g_H: the task goal that the trajectory reached, read at its last real step."""
+    return trajectory.outcomes[trajectory.length - 1]
+
+
+def sample_prompt(
+    key: PRNGKeyArray,
+    trajectory: Trajectory,
+    final_goal: Float[Array, "G"],
+    num_slots: int,
+    max_goals: int | Int[Array, ""] | None = None,
+    candidates: Bool[Array, "T"] | None = None,
+) -> Prompt:
+    """Draw (g_i1, .., g_ik, final_goal) with k ~ U[0, K-1] and i1 < .. < ik from a trajectory.
+
+    Args:
+      key: random key.
+      trajectory: where the goals come from; only reached goals before its end are candidates.
+      final_goal: last goal of the prompt; in hindsight ``hindsight_outcome(trajectory)``, in
+        adaptation the task goal g^M.
+      num_slots: P, the number of slots of the returned prompt (static).
+      max_goals: K <= P, the largest number of goals with the final one (traced; default P).
+      candidates: further restriction of the steps that may give a goal.
+
+    Returns:
+      A right-aligned prompt; goals keep the order in which the trajectory reached them.
+    """
+    key_count, key_index = jax.random.split(key)
+    num_steps = trajectory.goal_reached.shape[0]
+    time = jnp.arange(num_steps)
+    # The step that reaches the final goal would only repeat it.
+    repeats_end = (time == trajectory.length - 1) & jnp.all(
+        trajectory.goals == trajectory.outcomes, axis=-1
+    )
+    eligible = trajectory.goal_reached & (time < trajectory.length) & ~repeats_end
+    if candidates is not None:
+        eligible &= candidates
+
+    max_goals = num_slots if max_goals is None else max_goals
+    count = jax.random.randint(key_count, (), 0, max_goals)
+    count = jnp.minimum(count, eligible.sum())
+
+    num_drawn = min(num_slots - 1, num_steps)
+    rank = jnp.arange(num_drawn)
+    scores = jnp.where(eligible, jax.random.uniform(key_index, (num_steps,)), -1.0)
+    _, drawn = jax.lax.top_k(scores, num_drawn)
+    drawn = jnp.sort(jnp.where(rank < count, drawn, -1))  # unused slots first, then in order
+
+    empty = num_slots - 1 - num_drawn
+    mask = jnp.concatenate([jnp.zeros(empty, bool), drawn >= 0, jnp.ones(1, bool)])
+    goals = jnp.concatenate(
+        [jnp.zeros((empty, final_goal.shape[0])), trajectory.goals[drawn], final_goal[None]]
+    )
+    return Prompt(jnp.where(mask[:, None], goals, 0.0), mask)
+
+
+def loop_erased(goals: Float[Array, "T G"], length: Int[Array, ""]) -> Bool[Array, "T"]:
+    """Steps on the loop-erased path of a trajectory: detours that return to a goal are cut.
+
+    Waypoints drawn from these steps lie on a path that leads on, never on one that turns back.
+    """
+    num_steps = goals.shape[0]
+    time = jnp.arange(num_steps)
+    same = jnp.all(goals[:, None] == goals[None], axis=-1) & (time < length)[None]
+    last_visit = jnp.max(jnp.where(same, time[None], -1), axis=1)
+
+    def walk(resume_at: Array, t: Array) -> tuple[Array, Array]:
+        on_path = t >= resume_at
+        return jnp.where(on_path, last_visit[t] + 1, resume_at), on_path
+
+    _, on_path = jax.lax.scan(walk, jnp.zeros((), last_visit.dtype), time)
+    return on_path & (time < length)

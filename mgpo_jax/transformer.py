@@ -1,0 +1,271 @@
+"""The multi-goal causal Transformer (paper, section 3.1, appendix D, Table 6).
+
+One sequence is ``(g_1 .. g_P, o_1, a_1, o_2, a_2, .., o_T)``: goals, observations and actions enter
+through three linear layers, observations and actions of one step share a learned timestep embedding,
+and the outputs at the observations are the action distributions. The module is written for one
+sequence and has three entries that share their layers: the full pass (training), and ``prefill`` /
+``decode`` with an explicit key-value cache (acting).
+
+Two deliberate differences from the authors' code: prompt slots get a learned position embedding
+(``prompt_order=True``; theirs reach the network without any, so that their order is visible through
+the causal mask alone), and all tokens pass the input LayerNorm (theirs: all but the goals).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from mgpo_jax.distributions import HEADS, Distribution
+from mgpo_jax.types import Prompt
+
+# Attention over the keys of one query block at a time: never the full score matrix.
+QUERY_BLOCK = 128
+
+
+@dataclass(frozen=True)
+class TransformerConfig:
+    """Sizes of the network. Defaults are Table 6 of the paper."""
+
+    obs_dim: int
+    goal_dim: int
+    action_dim: int
+    horizon: int
+    """Largest number of steps T of an episode."""
+    head: Literal["categorical", "gaussian"] = "categorical"
+    max_prompt_length: int = 5
+    """K, the number of prompt slots."""
+    embed_dim: int = 128
+    num_layers: int = 3
+    num_heads: int = 1
+    dropout: float = 0.1
+    """Rate on embeddings, attention weights and residual branches."""
+    prompt_order: bool = True
+    """Whether prompt slots carry a position embedding (the paper's network: False)."""
+
+    @property
+    def sequence_length(self) -> int:
+        """Tokens of a full sequence: K goals, T observations and T - 1 actions."""
+        return self.max_prompt_length + 2 * self.horizon - 1
+
+
+class KVCache(NamedTuple):
+    """Keys and values of the tokens seen so far, for each layer; ``step`` is the next timestep."""
+
+    keys: tuple[Float[Array, "*batch H S E"], ...]
+    values: tuple[Float[Array, "*batch H S E"], ...]
+    prompt_mask: Bool[Array, "*batch P"]
+    step: Int[Array, ""]
+
+
+def grow_cache(cache: KVCache, num_tokens: int) -> KVCache:
+    """The same cache with room for ``num_tokens`` more; its cost is that of its room."""
+    pad = ((0, 0), (0, num_tokens), (0, 0))
+    keys, values = jax.tree.map(lambda rows: jnp.pad(rows, pad), (cache.keys, cache.values))
+    return cache._replace(keys=keys, values=values)
+
+
+Attend = Callable[[Array, Array, Array], Array]  # queries, keys, values of the new tokens -> mixed
+
+
+class Block(nn.Module):
+    """Pre-LayerNorm Transformer block with a ReLU feed-forward layer."""
+
+    config: TransformerConfig
+
+    def setup(self) -> None:
+        width = self.config.embed_dim
+        residual_init = nn.initializers.normal(0.02 / (2 * self.config.num_layers) ** 0.5)
+        self.norm_attention = nn.LayerNorm()
+        self.query = nn.Dense(width)
+        self.key_value = nn.Dense(2 * width)
+        self.mix = nn.Dense(width, kernel_init=residual_init)
+        self.norm_mlp = nn.LayerNorm()
+        self.expand = nn.Dense(4 * width)
+        self.contract = nn.Dense(width, kernel_init=residual_init)
+        self.dropout = nn.Dropout(self.config.dropout)
+
+    def __call__(
+        self, x: Float[Array, "S E"], rows: slice, attend: Attend, deterministic: bool
+    ) -> Float[Array, "R E"]:
+        """Transform the tokens ``x[rows]``, which attend to keys and values of all of ``x``."""
+        h = self.norm_attention(x)
+        heads = (-1, self.config.num_heads, self.config.embed_dim // self.config.num_heads)
+        query = self.query(h[rows]).reshape(heads)
+        key, value = jnp.split(self.key_value(h), 2, axis=-1)
+        mixed = attend(query, key.reshape(heads), value.reshape(heads))
+        x = x[rows] + self.dropout(self.mix(mixed), deterministic=deterministic)
+        h = self.contract(nn.relu(self.expand(self.norm_mlp(x))))
+        return x + self.dropout(h, deterministic=deterministic)
+
+
+def _attention(
+    query: Float[Array, "R H E"],
+    key: Float[Array, "S H E"],
+    value: Float[Array, "S H E"],
+    visible: Bool[Array, "R S"],
+    drop: Callable[[Array], Array] = lambda weights: weights,
+) -> Float[Array, "R HE"]:
+    scores = jnp.einsum("rhe,she->hrs", query, key) * query.shape[-1] ** -0.5
+    weights = jax.nn.softmax(jnp.where(visible, scores, -1e9), axis=-1)
+    return jnp.einsum("hrs,she->rhe", drop(weights), value).reshape(query.shape[0], -1)
+
+
+def _attention_by_row(
+    query: Float[Array, "R H E"],
+    key: Float[Array, "H S E"],
+    value: Float[Array, "H S E"],
+    visible: Bool[Array, "R S"],
+) -> Float[Array, "R HE"]:
+    """The same for a few queries: matrix-vector products, which XLA's CPU backend runs some eight
+    times faster than products with a matrix of two rows."""
+
+    def of_head(query: Array, key: Array, value: Array, visible: Array) -> Array:
+        scores = (key @ query) * query.shape[-1] ** -0.5
+        return jax.nn.softmax(jnp.where(visible, scores, -1e9)) @ value
+
+    heads = jax.vmap(of_head, in_axes=(0, 0, 0, None))
+    rows = [heads(q, key, value, v).ravel() for q, v in zip(query, visible, strict=True)]
+    return jnp.stack(rows)
+
+
+class GoalTransformer(nn.Module):
+    """The policy network pi_theta(a_t | p, h_{t-1}, o_t)."""
+
+    config: TransformerConfig
+
+    def setup(self) -> None:
+        config = self.config
+        small = nn.initializers.normal(0.02)
+        self.embed_goal = nn.Dense(config.embed_dim)
+        self.embed_obs = nn.Dense(config.embed_dim)
+        self.embed_action = nn.Dense(config.embed_dim)
+        self.embed_time = self.param("embed_time", small, (config.horizon, config.embed_dim))
+        if config.prompt_order:
+            shape = (config.max_prompt_length, config.embed_dim)
+            self.embed_slot = self.param("embed_slot", small, shape)
+        self.norm_in = nn.LayerNorm()
+        self.blocks = [Block(config) for _ in range(config.num_layers)]
+        self.norm_out = nn.LayerNorm()
+        self.head = nn.Dense(HEADS[config.head].num_params(config.action_dim))
+        self.dropout = nn.Dropout(config.dropout)
+
+    def __call__(
+        self,
+        prompt: Prompt,
+        obs: Float[Array, "T D"],
+        actions: Array,
+        deterministic: bool = True,
+    ) -> Distribution:
+        """Action distributions at all T observations (T at most the horizon).
+
+        With ``deterministic=False`` dropout is on and an rng named ``dropout`` is needed.
+        """
+        num_steps = obs.shape[0]
+        num_slots = self.config.max_prompt_length
+        time = self.embed_time[:num_steps]
+        pairs = jnp.stack([self._obs_token(obs, time), self._action_token(actions, time)], axis=1)
+        steps = pairs.reshape(2 * num_steps, -1)[:-1]  # nothing follows the last action
+        x = self.norm_in(jnp.concatenate([self._prompt_tokens(prompt), steps]))
+        x = self.dropout(x, deterministic=deterministic)
+
+        num_tokens = num_slots + 2 * num_steps - 1
+        seen = jnp.concatenate([prompt.mask, jnp.ones(2 * num_steps - 1, bool)])
+        positions = jnp.arange(num_tokens)
+        drop = lambda weights: self.dropout(weights, deterministic=deterministic)  # noqa: E731
+        for index, block in enumerate(self.blocks):
+            last = index == self.config.num_layers - 1
+            # Only observations are read out, so the last layer computes nothing else.
+            rows = slice(num_slots, None, 2) if last else slice(None)
+            row_positions = range(num_tokens)[rows]
+
+            def attend(query: Array, key: Array, value: Array, at: range = row_positions) -> Array:
+                mixed = []
+                for start in range(0, len(at), QUERY_BLOCK):
+                    block_at = at[start : start + QUERY_BLOCK]
+                    end = block_at[-1] + 1  # later keys are hidden by causality
+                    visible = seen[None, :end] & (
+                        positions[None, :end] <= jnp.asarray(block_at)[:, None]
+                    )
+                    part = query[start : start + QUERY_BLOCK]
+                    mixed.append(_attention(part, key[:end], value[:end], visible, drop))
+                return jnp.concatenate(mixed)
+
+            x = block(x, rows, attend, deterministic)
+        return self._read_out(x)
+
+    def prefill(self, prompt: Prompt, obs: Float[Array, "D"]) -> tuple[Distribution, KVCache]:
+        """Read the prompt and the first observation; returns pi(a_1) and the cache."""
+        config = self.config
+        first = self._obs_token(obs[None], self.embed_time[:1])
+        x = self.norm_in(jnp.concatenate([self._prompt_tokens(prompt), first]))
+        shape = (config.num_heads, 0, config.embed_dim // config.num_heads)
+        empty = (jnp.zeros(shape, x.dtype),) * config.num_layers
+        cache = KVCache(empty, empty, prompt.mask, jnp.zeros((), jnp.int32))
+        return self._extend(x, grow_cache(cache, len(x)), at=0)
+
+    def decode(
+        self, cache: KVCache, action: Array, obs: Float[Array, "D"]
+    ) -> tuple[Distribution, KVCache]:
+        """Append (a_{t-1}, o_t); returns pi(a_t) and the longer cache.
+
+        The cache must have room for two more tokens (``grow_cache``).
+        """
+        times = jax.lax.dynamic_slice_in_dim(self.embed_time, cache.step - 1, 2)
+        tokens = [
+            self._action_token(jnp.asarray(action)[None], times[:1]),
+            self._obs_token(obs[None], times[1:]),
+        ]
+        x = self.norm_in(jnp.concatenate(tokens))
+        return self._extend(x, cache, at=self.config.max_prompt_length + 2 * cache.step - 1)
+
+    def _extend(
+        self, x: Float[Array, "R E"], cache: KVCache, at: int | Int[Array, ""]
+    ) -> tuple[Distribution, KVCache]:
+        """Run new tokens, the first of them at position ``at``, against the cache."""
+        num_new = len(x)
+        capacity = cache.keys[0].shape[1]
+        num_steps_tokens = capacity - self.config.max_prompt_length
+        seen = jnp.concatenate([cache.prompt_mask, jnp.ones(num_steps_tokens, bool)])
+        keys, values = [], []
+        for index, block in enumerate(self.blocks):
+            last = index == self.config.num_layers - 1
+            first_row = num_new - 1 if last else 0
+            row_positions = at + jnp.arange(first_row, num_new)
+            visible = seen & (jnp.arange(capacity) <= row_positions[:, None])
+
+            def attend(
+                query: Array, key: Array, value: Array, index: int = index, visible: Array = visible
+            ) -> Array:
+                key, value = (
+                    jax.lax.dynamic_update_slice_in_dim(old, new.swapaxes(0, 1), at, axis=1)
+                    for old, new in ((cache.keys[index], key), (cache.values[index], value))
+                )
+                keys.append(key)
+                values.append(value)
+                return _attention_by_row(query, key, value, visible)
+
+            x = block(x, slice(first_row, None), attend, True)
+        grown = KVCache(tuple(keys), tuple(values), cache.prompt_mask, cache.step + 1)
+        return jax.tree.map(lambda leaf: leaf[-1], self._read_out(x)), grown
+
+    def _prompt_tokens(self, prompt: Prompt) -> Float[Array, "P E"]:
+        tokens = self.embed_goal(prompt.goals)
+        return tokens + self.embed_slot if self.config.prompt_order else tokens
+
+    def _obs_token(self, obs: Float[Array, "T D"], time: Array) -> Float[Array, "T E"]:
+        return self.embed_obs(obs) + time
+
+    def _action_token(self, actions: Array, time: Array) -> Float[Array, "T E"]:
+        if self.config.head == "categorical":
+            actions = jax.nn.one_hot(actions, self.config.action_dim)
+        return self.embed_action(actions) + time
+
+    def _read_out(self, x: Float[Array, "R E"]) -> Distribution:
+        return HEADS[self.config.head].make(self.head(self.norm_out(x)))

@@ -1,0 +1,36 @@
+"""Shared fixtures. jaxtyping's shapes are enforced on every call while tests run."""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+# Two devices, so that what is spread over devices is tested as such.
+os.environ.setdefault("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
+
+import jax
+import jaxtyping
+import pytest
+
+jaxtyping.install_import_hook(["mgpo_jax", "envs"], "beartype.beartype")
+jax.config.update("jax_numpy_rank_promotion", "allow")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--all", action="store_true", help="run the slow tests too")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "slow: runs only with --all")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if not config.getoption("--all"):
+        for item in items:
+            if "slow" in item.keywords:
+                item.add_marker(pytest.mark.skip(reason="slow: pass --all"))
+
+
+@pytest.fixture
+def key() -> jax.Array:
+    return jax.random.key(0)
