@@ -7,6 +7,8 @@ plan anew at every step of thousands of mazes at once.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, UInt32
@@ -56,7 +58,7 @@ def distances(free: Bool[Array, "S S"], source: Int[Array, "2"]) -> Int[Array, "
 
     # A cell found by step s (counted from 0) gets s in binary: one board for each bit. The low bits
     # are known at compile time within an unrolled round, the high ones are the same for all of it.
-    def search(carry: tuple[Array, ...]) -> tuple[Array, ...]:
+    def search(carry: Any) -> Any:
         reached, _, low, high, round_ = carry
         before = reached
         low = list(low)
@@ -91,7 +93,7 @@ def toward(
     neighbors = spread(single(source, side)) & ~single(source, side)
     open_ = pack(free) | origin
 
-    def search(carry: tuple[Array, ...]) -> tuple[Array, ...]:
+    def search(carry: Any) -> Any:
         reached, found, _ = carry
         grown = reached
         for _ in range(ROUND):

@@ -34,6 +34,8 @@ class MazeTask(NamedTuple):
 
 
 class MazeState(NamedTuple):
+    """An episode in progress."""
+
     task: MazeTask
     position: Int[Array, "2"]
     steps: Int[Array, ""]

@@ -1,0 +1,1 @@
+"""Command lines: collect, pretrain, adapt, plot, bench."""

@@ -1,0 +1,1 @@
+"""Pre-trained multi-goal Transformers with prompt optimization: the method."""

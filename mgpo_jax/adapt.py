@@ -40,6 +40,8 @@ class AdaptLog(NamedTuple):
 
 
 class AdaptResult(NamedTuple):
+    """A finished adaptation."""
+
     log: AdaptLog
     prompt: Prompt
     """The optimized prompt p*."""

@@ -64,8 +64,9 @@ class Dataset:
             mask = real.reshape(real.shape + (1,) * (steps.ndim - 1))
             return np.where(mask, steps[rows], np.zeros((), steps.dtype))
 
-        arrays = [padded(getattr(self, name)) for name in Trajectory._fields[:-1]]
-        return Trajectory(*arrays, length=lengths.astype(np.int32))
+        arrays: list[Any] = [padded(getattr(self, name)) for name in Trajectory._fields[:-1]]
+        length: Any = lengths.astype(np.int32)  # numpy arrays go where jax's do
+        return Trajectory(*arrays, length=length)
 
 
 def hash_task(fingerprint: np.ndarray) -> np.uint64:

@@ -67,7 +67,7 @@ class Stats(NamedTuple):
 
     nll: Float[Array, "*batch"]
     correct: Float[Array, "*batch"]
-    count: Float[Array, "*batch"]
+    num_steps: Float[Array, "*batch"]
 
 
 def learning_rate_schedule(config: TrainConfig) -> optax.Schedule:
@@ -95,7 +95,7 @@ def bc_loss(
     key_prompt, key_dropout = jax.random.split(key)
     num_slots = network.config.max_prompt_length
     prompt = sample_prompt(key_prompt, trajectory, hindsight_outcome(trajectory), num_slots)
-    distribution = network.apply(
+    distribution: Any = network.apply(
         params,
         prompt,
         trajectory.obs,
@@ -175,13 +175,13 @@ def make_trainer(
     @partial(jax.jit, donate_argnums=(0, 1))
     def update(params: Any, opt_state: Any, rows: list[Any]) -> tuple[Any, Any, dict[str, Array]]:
         flat, stats = jax.tree.map(lambda *of_devices: sum(of_devices)[0], *rows)
-        grads = unravel(flat / stats.count)
+        grads = unravel(flat / stats.num_steps)
         updates, opt_state = optimizer.update(grads, opt_state, params)
         metrics = {
-            "loss": stats.nll / stats.count,
-            "accuracy": stats.correct / stats.count,
+            "loss": stats.nll / stats.num_steps,
+            "accuracy": stats.correct / stats.num_steps,
             "grad_norm": optax.global_norm(grads),
-            "num_steps": stats.count,
+            "num_steps": stats.num_steps,
         }
         return optax.apply_updates(params, updates), opt_state, metrics
 
@@ -214,7 +214,7 @@ def make_trainer(
     def evaluate(params: Any, plans: list[BatchPlan]) -> dict[str, float]:
         stats = [part_stats(params, key_eval, dataset.gather(*plan)) for plan in plans]
         total = jax.tree.map(lambda *leaves: float(sum(leaves)), *stats)
-        return {"loss": total.nll / total.count, "accuracy": total.correct / total.count}
+        return {"loss": total.nll / total.num_steps, "accuracy": total.correct / total.num_steps}
 
     return Trainer(init, step, evaluate)
 

@@ -12,7 +12,6 @@ from envs.base import Agent, Environment, State, Task, TimeStep
 from mgpo_jax.policy import Policy
 from mgpo_jax.types import Episode, PRNGKeyArray, Query, Trajectory
 
-
 NUM_SEGMENTS = 8
 
 

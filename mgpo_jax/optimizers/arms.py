@@ -30,7 +30,7 @@ class Arms(NamedTuple):
     """M prompts with their return statistics; rows from ``size`` on are free."""
 
     prompts: Prompt
-    count: Float[Array, "M"]
+    pulls: Float[Array, "M"]
     mean: Float[Array, "M"]
     sum_sq: Float[Array, "M"]
     """Sum of squared deviations from the mean (Welford)."""
@@ -40,12 +40,12 @@ class Arms(NamedTuple):
 
     @property
     def taken(self) -> Bool[Array, "M"]:
-        return jnp.arange(len(self.count)) < self.size
+        return jnp.arange(len(self.pulls)) < self.size
 
     @property
     def std(self) -> Float[Array, "M"]:
         """Population standard deviation of each arm's returns."""
-        return jnp.sqrt(self.sum_sq / jnp.maximum(self.count, 1))
+        return jnp.sqrt(self.sum_sq / jnp.maximum(self.pulls, 1))
 
     def prompt(self, arm: Int[Array, ""]) -> Prompt:
         return jax.tree.map(lambda rows: rows[arm], self.prompts)
@@ -62,24 +62,24 @@ def empty_arms(num_arms: int, num_slots: int, goal_dim: int) -> Arms:
 def insert_arm(arms: Arms, prompt: Prompt, return_: Float[Array, ""]) -> Arms:
     """A new arm with history {return_}; in a full table it replaces the worst greedy return."""
     worst = jnp.argmin(jnp.where(arms.taken, arms.greedy_return, jnp.inf))
-    row = jnp.where(arms.size < len(arms.count), arms.size, worst)
+    row = jnp.where(arms.size < len(arms.pulls), arms.size, worst)
     return Arms(
         prompts=jax.tree.map(lambda rows, new: rows.at[row].set(new), arms.prompts, prompt),
-        count=arms.count.at[row].set(1.0),
+        pulls=arms.pulls.at[row].set(1.0),
         mean=arms.mean.at[row].set(return_),
         sum_sq=arms.sum_sq.at[row].set(0.0),
         greedy_return=arms.greedy_return.at[row].set(return_),
-        size=jnp.minimum(arms.size + 1, len(arms.count)),
+        size=jnp.minimum(arms.size + 1, len(arms.pulls)),
     )
 
 
 def update_arm(arms: Arms, arm: Int[Array, ""], return_: Float[Array, ""]) -> Arms:
     """Add one return to the history of an arm."""
-    count = arms.count[arm] + 1
+    pulls = arms.pulls[arm] + 1
     delta = return_ - arms.mean[arm]
-    mean = arms.mean[arm] + delta / count
+    mean = arms.mean[arm] + delta / pulls
     return arms._replace(
-        count=arms.count.at[arm].set(count),
+        pulls=arms.pulls.at[arm].set(pulls),
         mean=arms.mean.at[arm].set(mean),
         sum_sq=arms.sum_sq.at[arm].add(delta * (return_ - mean)),
     )

@@ -17,7 +17,7 @@ from mgpo_jax.types import PRNGKeyArray
 
 
 def posterior(
-    arms: Arms, return_range: tuple[float, float], min_std: float
+    arms: Arms, return_range: tuple[float, float], min_std: float | Float[Array, ""]
 ) -> tuple[Float[Array, "M"], Float[Array, "M"]]:
     """Mean and standard deviation of each arm's returns after its history (Eq. 4).
 
@@ -27,14 +27,17 @@ def posterior(
     low, high = return_range
     prior_mean, prior_std = (low + high) / 2, (high - low) / 2
     spread = jnp.maximum(arms.std, min_std * prior_std)
-    spread = jnp.where(arms.count < 2, prior_std, spread)
-    precision = 1 / prior_std**2 + arms.count / spread**2
-    mean = (prior_mean / prior_std**2 + arms.count * arms.mean / spread**2) / precision
+    spread = jnp.where(arms.pulls < 2, prior_std, spread)
+    precision = 1 / prior_std**2 + arms.pulls / spread**2
+    mean = (prior_mean / prior_std**2 + arms.pulls * arms.mean / spread**2) / precision
     return mean, precision**-0.5
 
 
 def shortfall(
-    arms: Arms, best_return: Float[Array, ""], return_range: tuple[float, float], min_std: float
+    arms: Arms,
+    best_return: Float[Array, ""],
+    return_range: tuple[float, float],
+    min_std: float | Float[Array, ""],
 ) -> Float[Array, "M"]:
     """(R* - mu_p) / sigma_p for each arm; infinite for free rows."""
     mean, std = posterior(arms, return_range, min_std)

@@ -14,9 +14,9 @@ def upper_confidence_bounds(
     arms: Arms, c: float | Float[Array, ""], scale: float
 ) -> Float[Array, "M"]:
     """UCB(p) = mean + c * scale * sqrt(log N / 2 n_p) for each arm (Eq. 3 has scale 1)."""
-    count = jnp.maximum(arms.count, 1)
-    total = jnp.maximum(jnp.sum(arms.count), 1)
-    bounds = arms.mean + c * scale * jnp.sqrt(jnp.log(total) / (2 * count))
+    pulls = jnp.maximum(arms.pulls, 1)
+    total = jnp.maximum(jnp.sum(arms.pulls), 1)
+    bounds = arms.mean + c * scale * jnp.sqrt(jnp.log(total) / (2 * pulls))
     return jnp.where(arms.taken, bounds, -jnp.inf)
 
 
