@@ -1,10 +1,10 @@
 """Demonstrators of MazeRunner: "A*-n" and "Random" (paper, appendices B.3 and C.1).
 
-Both know only what their four rays have shown them. A*-n visits n random goals: a goal on the known
-map is approached on the shortest known path; otherwise the demonstrator walks to the seen but
+Both know only what their four rays have shown them. A*-n visits n random goals: a goal on the
+known map is approached on the shortest known path; otherwise the demonstrator walks to the seen but
 unvisited cell that minimizes G + H, the known path to it plus its Manhattan distance to the goal. It
-chooses anew on arrival and whenever a goal is reached; ties go to the cell nearest to the goal. Random walks to one of the five nearest seen
-but unvisited cells.
+chooses anew on arrival and whenever a goal is reached; ties go to the cell nearest to the goal.
+Random walks to one of the five nearest seen but unvisited cells.
 
 Known maps are bitboards (``envs.bitboard``). The path to the chosen cell is re-read from the known map
 at every step, so that a shortcut seen on the way is taken.
