@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
@@ -56,6 +56,7 @@ class TimeStep(NamedTuple):
     truncated: Bool[Array, ""]
 
 
+@runtime_checkable
 class Environment(Protocol):
     """A world. Frozen and hashable, so that equal worlds share one compiled program."""
 
@@ -96,8 +97,8 @@ class Environment(Protocol):
 class Agent(NamedTuple):
     """Whoever acts in an episode: a policy with its prompt, or a demonstrator of a dataset.
 
-    ``begin`` and ``proceed`` return ``(action, quits, memory)``; an agent that quits ends the episode before
-    the action.
+    ``begin`` and ``proceed`` return ``(action, quits, memory)``; an agent that quits ends the episode
+    before the action.
     """
 
     begin: Callable

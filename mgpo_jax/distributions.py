@@ -7,7 +7,7 @@ a distribution with ``log_prob``, ``sample`` and ``mode``.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int
 from mgpo_jax.types import PRNGKeyArray
 
 
+@runtime_checkable
 class Distribution(Protocol):
     """A distribution over one action."""
 

@@ -1,0 +1,343 @@
+"""Adapt a policy to unseen tasks: ``python -m experiments.adapt --bandit ucb``."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from jax.sharding import PartitionSpec
+from tqdm import tqdm
+
+from envs.base import Environment, Task
+from experiments.configs import RUNS, make_env, positive
+from experiments.policies import LoadedPolicy, load_network, released_folder
+from experiments.runtime import Common, new_folder, provenance, run, write_json
+from experiments.statistics import seed_spread, stratified_bootstrap_iqm
+from experiments.tasks import benchmark_tasks, load_tasks, num_tasks, save_tasks
+from mgpo_jax.adapt import AdaptLog, continue_adaptation, evaluate, start_adaptation
+from mgpo_jax.errors import UsageError, nearest
+from mgpo_jax.optimizers import OPTIMIZERS, SearchSpace
+from mgpo_jax.policy import transformer_policy
+from mgpo_jax.sharding import AXIS, device_mesh, split
+
+LANES = "lanes"
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """Hyper-parameters of the optimizers; None leaves the optimizer's own default."""
+
+    c: float | None = None
+    """UCB: exploration constant [1]."""
+    scale: float | None = None
+    """UCB: unit of returns for c; 1 is Eq. 3 as printed (default: span of the world's returns)."""
+    min_std: float | None = None
+    """BPE: smallest spread of a prompt's returns, as a share of the prior's (default 0.02)."""
+    num_edits: int | None = None
+    """GRIPS: edited prompts an iteration [5]."""
+    population_size: int | None = None
+    """BBT: population of CMA-ES [10]."""
+    latent_dim: int | None = None
+    """BBT: dimension of z (default 5)."""
+    std_init: float | None = None
+    """BBT: initial step size, in units of goals (default 0.1)."""
+
+
+@dataclass(frozen=True)
+class AdaptConfig(Common):
+    """Settings of ``experiments.adapt``; values in brackets are the paper's."""
+
+    env: str = "maze15"
+    """The world: maze15, maze30."""
+    bandit: str = "ucb"
+    """The prompt optimizer: ucb, bpe, explore, grips or bbt."""
+    policy: Path | None = None
+    """Folder of a policy (default: the released one of the world)."""
+    tasks: Path | None = None
+    """Your own tasks, an npz file; mazes: maze [N, S, S] with 1 = wall, goal [N, 2] row and column
+    (default: the 50 test tasks of the world)."""
+    seeds: int = 3
+    """Independent adaptations to each task [3]."""
+    episodes: int = 100
+    """Budget of episodes a task, the first evaluation of (g^M) included [100]."""
+    seed: int = 0
+    """Seed of the adaptations."""
+    max_goals: int | None = None
+    """K, the longest prompt to try (default: what the policy was trained with) [5]."""
+    eval_every: int = 10
+    """Episodes between evaluations of the best prompt, which are outside of the budget."""
+    out: Path | None = None
+    """Result folder (default: runs/adapt/ENV/BANDIT-seedSEED)."""
+    figures: bool = True
+    """Draw the figures."""
+    options: Annotated[OptimizerConfig, tyro.conf.arg(name="")] = field(
+        default_factory=OptimizerConfig
+    )
+
+    @property
+    def folder(self) -> Path:
+        return self.out or RUNS / "adapt" / self.env / f"{self.bandit}-seed{self.seed}"
+
+
+class Outcome(NamedTuple):
+    """Raw results, axes S seeds, N tasks, E episodes, C evaluations."""
+
+    log: AdaptLog
+    """Leaves [S, N, E, ..]."""
+    eval_episodes: np.ndarray
+    """[C]: after how many episodes the best prompt was evaluated."""
+    eval_returns: np.ndarray
+    """[S, N, C] greedy returns of the best prompt; the first is that of the prompt (g^M)."""
+    num_episodes: int
+    """All episodes that were run, searches and evaluations."""
+    cpu_seconds: float
+    """CPU time of all of them, without compilation."""
+
+
+def run_adaptation(
+    env: Environment,
+    network: LoadedPolicy,
+    make_optimizer: Callable[[SearchSpace], Any],
+    tasks: Task,
+    *,
+    seeds: int,
+    episodes: int,
+    seed: int = 0,
+    max_goals: int | None = None,
+    eval_every: int = 10,
+) -> Outcome:
+    """Adapt to every task with every seed in one compiled program, spread over the devices."""
+    num, mesh = num_tasks(tasks), device_mesh()
+    lanes = seeds * num
+    padded = -(-lanes // mesh.devices.size) * mesh.devices.size
+    index = jnp.arange(padded) % num  # lanes beyond the last seed only fill up the devices
+    lane_tasks = jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], tasks)
+    keys = jax.random.split(jax.random.key(seed), padded)
+
+    def parts(params: Any) -> tuple[Any, Any]:
+        policy = transformer_policy(network.config, params)
+        space = SearchSpace(
+            policy.num_slots, env.sample_goal, env.spec.return_range, episodes, max_goals
+        )
+        return policy, make_optimizer(space)
+
+    def over_lanes(function: Callable) -> Any:
+        """Run for every lane, a share of them on each device; the last argument is shared."""
+        spec = PartitionSpec(AXIS)
+
+        def on_device(*args: Any) -> Any:
+            in_axes = (0,) * (len(args) - 1) + (None,)
+            return jax.vmap(function, in_axes=in_axes, axis_name=LANES)(*args)
+
+        def call(*args: Any) -> Any:
+            in_specs = (spec,) * (len(args) - 1) + (PartitionSpec(),)
+            return jax.shard_map(
+                on_device, mesh=mesh, in_specs=in_specs, out_specs=spec, check_vma=False
+            )(*args)
+
+        return jax.jit(call)
+
+    @over_lanes
+    def start(key: Any, task: Task, params: Any) -> Any:
+        return start_adaptation(key, env, *parts(params), task)
+
+    def piece(num_episodes: int) -> Any:
+        """Some episodes of the search, then an evaluation of the best prompt."""
+
+        @over_lanes
+        def advance(key: Any, state: Any, task: Task, params: Any) -> Any:
+            policy, optimizer = parts(params)
+            state, log = continue_adaptation(
+                state, env, policy, optimizer, task, num_episodes, LANES
+            )
+            best = optimizer.best(state.optimizer)
+            return state, log, evaluate(key, env, policy, task, best, LANES).return_
+
+        return advance
+
+    lane_tasks, keys = split(mesh, (lane_tasks, keys))
+    state = start(keys, lane_tasks, network.params)
+    sizes = [eval_every] * (episodes // eval_every)
+    sizes += [episodes % eval_every] if episodes % eval_every else []
+    programs = {
+        size: piece(size).lower(keys, state, lane_tasks, network.params).compile()
+        for size in set(sizes)
+    }
+    logs, evaluations = [], []
+    cpu = time.process_time()
+    with tqdm(total=episodes * lanes, unit="episode", disable=None) as progress:
+        for number, size in enumerate(sizes):
+            eval_keys = jax.vmap(partial(jax.random.fold_in, data=number))(keys)
+            state, log, returns = programs[size](eval_keys, state, lane_tasks, network.params)
+            logs.append(jax.device_get(log))
+            evaluations.append(np.asarray(returns))
+            progress.update(size * lanes)
+    cpu = time.process_time() - cpu
+
+    def by_seed(array: np.ndarray) -> np.ndarray:
+        return array[:lanes].reshape(seeds, num, *array.shape[1:])
+
+    log = jax.tree.map(lambda *leaves: by_seed(np.concatenate(leaves, axis=1)), *logs)
+    # The first episode of every search evaluates (g^M) greedily.
+    eval_returns = np.stack([log.returns[:, :, 0], *map(by_seed, evaluations)], axis=-1)
+    eval_episodes = np.concatenate([[1], np.cumsum(sizes)])
+    total = padded * (episodes + len(sizes))
+    return Outcome(log, eval_episodes, eval_returns, total, cpu)
+
+
+def summarize(config: AdaptConfig, outcome: Outcome, optimum: np.ndarray) -> dict[str, Any]:
+    """The numbers of ``summary.json`` and of the printed table."""
+    final = outcome.eval_returns[:, :, -1]
+    regret = optimum - final
+    iqm = stratified_bootstrap_iqm(final)
+    after = np.searchsorted(outcome.eval_episodes, 40)
+    at_40 = None
+    if after < len(outcome.eval_episodes) and outcome.eval_episodes[after] == 40:
+        at_40 = float((optimum - outcome.eval_returns[:, :, after]).mean())
+    spread = seed_spread(final)
+    return {
+        "env": config.env,
+        "optimizer": config.bandit,
+        "num_tasks": final.shape[1],
+        "num_seeds": final.shape[0],
+        "num_episodes": config.episodes,
+        "initial_return": float(outcome.eval_returns[:, :, 0].mean()),
+        "final_return": spread.mean,
+        "final_return_std_over_seeds": spread.std,
+        "final_return_iqm": iqm.value,
+        "final_return_iqm_95": [iqm.low, iqm.high],
+        "optimal_return": float(optimum.mean()),
+        "regret": float(regret.mean()),
+        "regret_std_over_seeds": seed_spread(regret).std,
+        "regret_after_40": at_40,
+        "solved_optimally": float((regret < 1e-4).mean()),
+        "best_episode_return": float(outcome.log.returns.max(axis=-1).mean()),
+        "cpu_seconds": outcome.cpu_seconds,
+        "episodes_per_cpu_second": outcome.num_episodes / outcome.cpu_seconds,
+    }
+
+
+def table(summary: dict[str, Any]) -> str:
+    """The printed result."""
+    low, high = summary["final_return_iqm_95"]
+    after_40 = summary["regret_after_40"]
+    rows = [
+        ("initial return", f"{summary['initial_return']:.3f}"),
+        (
+            "final return",
+            f"{summary['final_return']:.3f} ± {summary['final_return_std_over_seeds']:.3f}"
+            " (mean ± std over seeds)",
+        ),
+        ("  IQM", f"{summary['final_return_iqm']:.3f} [{low:.3f}, {high:.3f}] (95 %)"),
+        ("optimal return", f"{summary['optimal_return']:.3f}"),
+        ("regret", f"{summary['regret']:.3f} ± {summary['regret_std_over_seeds']:.3f}"),
+        ("  after 40", "-" if after_40 is None else f"{after_40:.3f}"),
+        ("solved optimally", f"{100 * summary['solved_optimally']:.0f} %"),
+        (
+            "speed",
+            f"{summary['episodes_per_cpu_second']:.0f} episodes per CPU-second"
+            f" ({summary['cpu_seconds']:.0f} CPU-seconds)",
+        ),
+    ]
+    head = (
+        f"{summary['env']}, {summary['optimizer']}: {summary['num_tasks']} tasks x "
+        f"{summary['num_seeds']} seeds x {summary['num_episodes']} episodes"
+    )
+    return "\n".join([head, "-" * len(head), *(f"{name:<17} {text}" for name, text in rows)])
+
+
+def save_results(
+    folder: Path, config: AdaptConfig, outcome: Outcome, tasks: Task, optimum: np.ndarray
+) -> dict[str, Any]:
+    """Write raw results, tasks, summary and provenance to an existing folder."""
+    log = outcome.log
+    np.savez_compressed(
+        folder / "results.npz",
+        allow_pickle=False,
+        returns=log.returns,
+        greedy=log.greedy,
+        prompt_goals=log.prompts.goals,
+        prompt_masks=log.prompts.mask,
+        best_goals=log.best.goals,
+        best_masks=log.best.mask,
+        eval_episodes=outcome.eval_episodes,
+        eval_returns=outcome.eval_returns,
+        optimal_returns=optimum,
+    )
+    save_tasks(folder / "tasks.npz", tasks)
+    summary = summarize(config, outcome, optimum)
+    write_json(folder / "config.json", config)
+    write_json(folder / "meta.json", provenance())
+    write_json(folder / "summary.json", summary)
+    return summary
+
+
+def chosen_tasks(env: Environment, path: Path | None) -> Task:
+    """A user's tasks, or the world's test tasks."""
+    if path is not None:
+        return load_tasks(path, env)
+    released = released_folder(env.spec.name) / "tasks.npz"
+    return load_tasks(released, env) if released.is_file() else benchmark_tasks(env)
+
+
+def chosen_optimizer(config: AdaptConfig) -> Callable[[SearchSpace], Any]:
+    """The optimizer's factory with the hyper-parameters that were given."""
+    if config.bandit not in OPTIMIZERS:
+        raise nearest(config.bandit, OPTIMIZERS, "optimizer")
+    values = {f.name: getattr(config.options, f.name) for f in fields(config.options)}
+    given = {name: value for name, value in values.items() if value is not None}
+    factory = OPTIMIZERS[config.bandit]
+    takes = factory.__code__.co_varnames[: factory.__code__.co_argcount]
+    for name in given:
+        if name not in takes:
+            raise UsageError(f"--{name.replace('_', '-')} is no option of {config.bandit}")
+    return partial(factory, **given)
+
+
+def main(config: AdaptConfig) -> None:
+    """Search a prompt for each task within a budget of episodes."""
+    positive(config, "seeds", "episodes", "max_goals", "eval_every")
+    positive(config.options, "num_edits", "population_size", "latent_dim")
+    env = make_env(config.env)
+    make_optimizer = chosen_optimizer(config)
+    network = load_network(env, config.policy)
+    longest = network.config.max_prompt_length
+    if config.max_goals is not None and config.max_goals > longest:
+        raise UsageError(
+            f"--max-goals {config.max_goals} is longer than the policy's prompts ({longest} goals); "
+            "pre-train with --max-prompt-length"
+        )
+    tasks = chosen_tasks(env, config.tasks)
+    folder = new_folder(config.folder, "remove it", "choose another with --out")
+    optimum = np.asarray(jax.jit(jax.vmap(env.optimal_return))(tasks))
+    outcome = run_adaptation(
+        env,
+        network,
+        make_optimizer,
+        tasks,
+        seeds=config.seeds,
+        episodes=config.episodes,
+        seed=config.seed,
+        max_goals=config.max_goals,
+        eval_every=config.eval_every,
+    )
+    summary = save_results(folder, config, outcome, tasks, optimum)
+    print(table(summary))
+    if config.figures:
+        from experiments.plot import draw_run
+
+        draw_run(folder)
+    print(f"results in {folder}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    run(tyro.conf.OmitArgPrefixes[AdaptConfig], main)

@@ -1,0 +1,140 @@
+"""Collect a dataset: ``python -m experiments.collect --env maze15 --policy astar4``."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from tqdm import tqdm
+
+from envs.base import Demonstrator, Environment
+from envs.experts import demonstrators
+from experiments.configs import data_root, make_env, positive
+from experiments.runtime import Common, run, versions
+from experiments.tasks import benchmark_tasks, task_hashes
+from mgpo_jax.dataset import Dataset, save_dataset
+from mgpo_jax.errors import UsageError, nearest
+from mgpo_jax.rollout import run_episode
+from mgpo_jax.types import Trajectory
+
+LANES = "lanes"
+BATCH = 250  # episodes at once: enough to fill the vector units, few enough to stay in cache
+
+
+@dataclass(frozen=True)
+class CollectConfig(Common):
+    """Settings of ``experiments.collect``."""
+
+    env: str = "maze15"
+    """The world: maze15, maze30."""
+    policy: str | None = None
+    """The demonstrator: astar1, astar2, astar4 or random in mazes (default: the world's first)."""
+    episodes: int = 10_000
+    """Trajectories to keep [10,000 in mazes]."""
+    seed: int = 0
+    """Seed of tasks and demonstrator."""
+    out: Path | None = None
+    """Folder to write (default: data/ENV/POLICY-EPISODES-seedSEED, under $MGPO_DATA if set)."""
+
+
+def dataset_folder(config: CollectConfig, policy: str) -> Path:
+    name = f"{policy}-{config.episodes}-seed{config.seed}"
+    return config.out or data_root() / config.env / name
+
+
+def find_demonstrator(env: Environment, policy: str | None) -> tuple[str, Demonstrator]:
+    """The demonstrator of that name; the world's first for None."""
+    known = demonstrators(env)
+    name = policy or next(iter(known))
+    if name not in known:
+        raise nearest(name, known, "demonstrator")
+    return name, known[name]
+
+
+def collect(
+    env: Environment, demonstrator: Demonstrator, episodes: int, seed: int
+) -> tuple[Dataset, dict[str, Any]]:
+    """Demonstrations on random tasks, none of them a test task, and facts about them."""
+
+    @jax.jit
+    @partial(jax.vmap, axis_name=LANES)
+    def demonstrate(key: jax.Array) -> tuple[Any, Trajectory, jax.Array]:
+        key_task, key_episode = jax.random.split(key)
+        task = demonstrator.sample_task(key_task)
+        trajectory = run_episode(key_episode, env, demonstrator.agent, task, LANES).trajectory
+        return task, trajectory, demonstrator.hindsight_return(trajectory)
+
+    forbidden = task_hashes(env, benchmark_tasks(env))
+    kept: list[tuple[Any, ...]] = []
+    num_kept = num_short = num_test = batch = 0
+    with tqdm(total=episodes, unit="episode", disable=None) as progress:
+        while num_kept < episodes:
+            key = jax.random.fold_in(jax.random.key(seed), batch)
+            tasks, trajectory, returns = jax.device_get(demonstrate(jax.random.split(key, BATCH)))
+            hashes = task_hashes(env, tasks)
+            long_enough = trajectory.length >= demonstrator.min_length
+            unseen = ~np.isin(hashes, forbidden)
+            rows = np.flatnonzero(long_enough & unseen)[: episodes - num_kept]
+            real = np.arange(trajectory.goal_reached.shape[1]) < trajectory.length[rows, None]
+            steps = [np.asarray(array)[rows][real] for array in trajectory[:-1]]
+            kept.append((*steps, trajectory.length[rows], hashes[rows], returns[rows]))
+            num_kept += len(rows)
+            num_short += int((~long_enough).sum())
+            num_test += int((long_enough & ~unseen).sum())
+            batch += 1
+            progress.update(len(rows))
+    *arrays, all_returns = (np.concatenate(parts) for parts in zip(*kept, strict=True))
+    dataset = Dataset(*arrays)
+    if np.isin(dataset.task_hashes, forbidden).any():
+        raise AssertionError("a test task is in the dataset")
+    facts = {
+        "dropped_short": num_short,
+        "dropped_test_tasks": num_test,
+        "length": _describe(dataset.lengths),
+        "at_horizon": float(np.mean(dataset.lengths == env.spec.horizon)),
+        "hindsight_return": _describe(all_returns),
+    }
+    return dataset, facts
+
+
+def _describe(values: np.ndarray) -> dict[str, Any]:
+    """Mean, quartiles and a histogram for the manifest."""
+    counts, edges = np.histogram(values, bins=16)
+    return {
+        "mean": float(values.mean()),
+        "quartiles": np.percentile(values, [0, 25, 50, 75, 100]).tolist(),
+        "histogram": {"counts": counts.tolist(), "edges": edges.round(3).tolist()},
+    }
+
+
+def main(config: CollectConfig) -> None:
+    """Collect demonstrations on random tasks, none of them a test task."""
+    positive(config, "episodes")
+    env = make_env(config.env)
+    policy, demonstrator = find_demonstrator(env, config.policy)
+    folder = dataset_folder(config, policy)
+    if folder.exists():
+        raise UsageError(f"{folder} exists already; remove it, or give another with --out")
+    cpu = time.process_time()
+    dataset, facts = collect(env, demonstrator, config.episodes, config.seed)
+    cpu = time.process_time() - cpu
+    made = {"env": config.env, "policy": policy, "seed": config.seed, "versions": versions()}
+    save_dataset(folder, dataset, {**made, **facts})
+    length, return_ = facts["length"]["mean"], facts["hindsight_return"]["mean"]
+    print(
+        f"{folder}: {len(dataset)} trajectories, {dataset.lengths.sum()} steps\n"
+        f"  mean length {length:.1f}, {100 * facts['at_horizon']:.1f} % at the horizon, "
+        f"mean hindsight return {return_:.2f}\n"
+        f"  {cpu:.1f} CPU-seconds with compilation",
+        file=sys.stderr,
+    )
+
+
+if __name__ == "__main__":
+    run(CollectConfig, main)

@@ -1,0 +1,152 @@
+"""Settings of the command lines, and the presets of each world.
+
+``fast`` is the recipe that two cores finish in well under an hour; ``paper`` has the paper's values
+(Table 6, and its code's where the text is silent); ``smoke`` only shows that everything runs.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+import envs
+from envs.base import Environment
+from experiments.runtime import Common, peek
+from mgpo_jax.errors import UsageError, nearest
+from mgpo_jax.pretrain import TrainConfig
+
+RUNS = Path("runs")
+PRETRAINED = Path(__file__).parent.parent / "pretrained"
+
+
+def data_root() -> Path:
+    return Path(os.environ.get("MGPO_DATA", "data"))
+
+
+def make_env(name: str) -> Environment:
+    """``envs.make`` with the error of a command line."""
+    try:
+        return envs.make(name)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+
+
+def positive(config: Any, *fields: str) -> None:
+    """Raise ``UsageError`` for a number that must be at least 1."""
+    for name in fields:
+        value = getattr(config, name)
+        if value is not None and value < 1:
+            raise UsageError(f"--{name.replace('_', '-')} must be at least 1, found {value}")
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """Which dataset."""
+
+    demonstrator: Annotated[str | None, tyro.conf.arg(name="policy")] = None
+    """Who collects it: astar1, astar2, astar4 or random in mazes (default: the world's first)."""
+    episodes: int = 10_000
+    """Trajectories kept [10,000 in mazes]."""
+    data_seed: Annotated[int, tyro.conf.arg(name="data-seed")] = 0
+    """Seed of the dataset."""
+
+
+@dataclass(frozen=True)
+class PretrainConfig(Common):
+    """Settings of ``experiments.pretrain``; values in brackets are the paper's."""
+
+    env: str = "maze15"
+    """The world: maze15, maze30."""
+    preset: str = "fast"
+    """Where the defaults below come from: fast, paper or smoke."""
+    data: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
+    train: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
+    max_prompt_length: int = 5
+    """K, the longest prompt [5]."""
+    dropout: float = 0.0
+    """Dropout rate [0.1]."""
+    prompt_order: bool = True
+    """Position embedding on prompt goals [False]."""
+    embed_dim: int = 128
+    """Width of the network [128]."""
+    num_layers: int = 3
+    """Transformer blocks [3]."""
+    num_heads: int = 1
+    """Attention heads [1]."""
+    holdout: int = 200
+    """Trajectories kept out of training for the validation loss."""
+    eval_tasks: int = 64
+    """Tasks of the greedy evaluation on the way (neither training nor test tasks)."""
+    eval_every: int = 1_000
+    """Steps between evaluations."""
+    save_every: int = 500
+    """Steps between checkpoints."""
+    out: Path | None = None
+    """Run folder (default: runs/pretrain/ENV/PRESET-seedSEED)."""
+    resume: bool = False
+    """Continue an interrupted run from its newest checkpoint, bit for bit."""
+    tb: bool = False
+    """Also write metrics for TensorBoard (extra: tb)."""
+    wandb: bool = False
+    """Also send metrics to Weights & Biases (extra: wandb)."""
+
+    @property
+    def folder(self) -> Path:
+        name = f"{self.preset}-seed{self.train.seed}"
+        return self.out or RUNS / "pretrain" / self.env / name
+
+
+# Jitted mazes make demonstrations cheaper than regularization: 10,000 trajectories are overfitted after
+# 5,000 fast steps, 100,000 take a minute to collect and are not.
+FAST_EPISODES = {"maze15": 100_000, "maze30": 10_000}
+
+PRESETS = ("fast", "paper", "smoke")
+
+# Steps of the authors' code (their text gives none), and of the fast recipe.
+PAPER_STEPS = {"maze15": 50_000, "maze30": 200_000}
+FAST = {
+    "maze15": TrainConfig(steps=20_000),
+    "maze30": TrainConfig(steps=20_000, part_size=4, bucket=32),
+}
+
+
+def pretrain_preset(env: str, preset: str) -> PretrainConfig:
+    """The default settings for a world."""
+    make_env(env)  # complains about an unknown name
+    if preset == "fast":
+        data = DataConfig(episodes=FAST_EPISODES[env])
+        return PretrainConfig(env=env, preset=preset, data=data, train=FAST[env])
+    if preset == "paper":
+        train = replace(
+            FAST[env],
+            steps=PAPER_STEPS[env],
+            learning_rate=1e-4,
+            warmup_steps=10_000,
+            schedule="constant",
+            clip_norm=0.25,
+        )
+        return PretrainConfig(env=env, preset=preset, train=train, dropout=0.1, prompt_order=False)
+    if preset == "smoke":
+        return PretrainConfig(
+            env=env,
+            preset=preset,
+            data=DataConfig(episodes=256),
+            train=replace(FAST[env], steps=40, warmup_steps=10, bucket=FAST[env].bucket * 8),
+            embed_dim=32,
+            num_layers=2,
+            holdout=32,
+            eval_tasks=8,
+            eval_every=20,
+            save_every=20,
+        )
+    raise nearest(preset, PRESETS, "preset")
+
+
+def pretrain_default(argv: Sequence[str]) -> PretrainConfig:
+    """The defaults that ``--env`` and ``--preset`` choose."""
+    return pretrain_preset(peek(argv, "env", "maze15"), peek(argv, "preset", "fast"))

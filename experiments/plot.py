@@ -1,0 +1,523 @@
+"""Draw figures from adaptation results: ``python -m experiments.plot RUN_DIR [RUN_DIR ...]``.
+
+Figures are numbered as in the paper: 6 and 7 learning curves, 2 prompts on mazes, 3 and 10 how prompt
+and behavior evolve, 9 short and long prompts.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial, wraps
+from pathlib import Path
+from typing import Any, NamedTuple, ParamSpec
+
+import jax
+import jax.numpy as jnp
+import matplotlib as mpl
+import numpy as np
+import tyro
+from matplotlib.colors import PowerNorm
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from envs.base import Environment
+from envs.maze_runner import MazeRunner, MazeTask
+from envs.render import (
+    INK,
+    PROMPT_COLOR,
+    bar_lanes,
+    draw_maze,
+    maze_gif,
+    visit_norm,
+    visit_scale,
+)
+from experiments.runtime import Common, run
+from mgpo_jax.errors import DataError, UsageError
+from mgpo_jax.policy import Policy
+from mgpo_jax.prompts import sample_prompt, single_goal
+from mgpo_jax.rollout import rollout
+from mgpo_jax.types import Episode, Prompt, Query
+
+NUM_ROLLOUTS = 64
+STAGES = (1, 10, 20, 40, 100)
+PANEL = 1.9  # inches of one maze
+
+STYLE = {
+    "figure.dpi": 150,
+    "savefig.dpi": 150,
+    "font.family": "DejaVu Sans",
+    "font.size": 8,
+    "axes.titlesize": 8,
+    "legend.fontsize": 7.5,
+    "legend.frameon": False,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": "#7A868C",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#E6E9EB",
+    "xtick.color": "#7A868C",
+    "ytick.color": "#7A868C",
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "lines.markersize": 4,
+}
+
+# Method -> (name in legends, color, line style, marker).
+METHODS = {
+    "ucb": ("MGPO-UCB", "#D55E00", "-", "o"),
+    "bpe": ("MGPO-BPE", "#0072B2", "-", "s"),
+    "explore": ("MGPO-explore", "#009E73", "-", "^"),
+    "grips": ("GRIPS", "#CC79A7", "--", "D"),
+    "bbt": ("BBT", "#56B4E9", "--", "v"),
+}
+SPARE_COLORS = ("#E69F00", "#6B6B6B", "#8C510A", "#5E3C99", "#B2182B", "#003C30")
+
+
+class Results(NamedTuple):
+    """One adaptation: S seeds, N tasks, E episodes, P slots, G goal size, C checkpoints."""
+
+    returns: np.ndarray  # [S, N, E]
+    greedy: np.ndarray  # [S, N, E]
+    prompt_goals: np.ndarray  # [S, N, E, P, G]
+    prompt_masks: np.ndarray  # [S, N, E, P]
+    best_goals: np.ndarray  # [S, N, E, P, G]
+    best_masks: np.ndarray  # [S, N, E, P]
+    eval_episodes: np.ndarray  # [C]
+    eval_returns: np.ndarray  # [S, N, C]
+    optimal_returns: np.ndarray  # [N]
+    tasks: dict[str, np.ndarray]  # each [N, ...]
+    config: dict[str, Any]
+    summary: dict[str, Any]
+
+    def best_prompt(self, seed: int, task: int, episodes: int | None = None) -> Prompt:
+        """The best prompt of one task after ``episodes`` episodes (default: all)."""
+        last = self.returns.shape[2] if episodes is None else episodes
+        index = (seed, task, last - 1)
+        return Prompt(jnp.asarray(self.best_goals[index]), jnp.asarray(self.best_masks[index]))
+
+
+FILES = ("results.npz", "tasks.npz", "config.json", "summary.json")
+AXES = {
+    "returns": "SNE",
+    "greedy": "SNE",
+    "prompt_goals": "SNEPG",
+    "prompt_masks": "SNEP",
+    "best_goals": "SNEPG",
+    "best_masks": "SNEP",
+    "eval_episodes": "C",
+    "eval_returns": "SNC",
+    "optimal_returns": "N",
+}
+
+
+def load_results(folder: Path) -> Results:
+    """Read the folder of one adaptation.
+
+    Raises:
+      DataError: if a file is missing, unreadable or does not fit the others.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise DataError(f"no result folder {folder}")
+    for name in FILES:
+        if not (folder / name).is_file():
+            raise DataError(f"{folder / name} is missing; is {folder} the folder of an adaptation?")
+    arrays, tasks = _load_arrays(folder / "results.npz"), _load_arrays(folder / "tasks.npz")
+    config, summary = _load_object(folder / "config.json"), _load_object(folder / "summary.json")
+    for name in ("env", "bandit"):
+        if not isinstance(config.get(name), str):
+            raise DataError(f"{folder / 'config.json'} does not name the {name}")
+
+    where = folder / "results.npz"
+    if missing := [name for name in AXES if name not in arrays]:
+        raise DataError(f"{where} lacks {', '.join(missing)}")
+    sizes: dict[str, int] = {}
+    for name, axes in AXES.items():
+        shape = arrays[name].shape
+        fits = len(shape) == len(axes) and all(
+            size > 0 and sizes.setdefault(axis, size) == size
+            for axis, size in zip(axes, shape, strict=True)
+        )
+        if not fits:
+            raise DataError(
+                f"{where}: {name} has shape {list(shape)}, which does not fit the axes {axes} "
+                f"({', '.join(f'{axis} {size}' for axis, size in sizes.items())})"
+            )
+    for name in ("returns", "eval_returns", "optimal_returns"):
+        if not np.isfinite(arrays[name]).all():
+            raise DataError(f"{where}: {name} holds NaN or infinity")
+    for name, array in tasks.items():
+        if array.ndim == 0 or len(array) != sizes["N"]:
+            raise DataError(
+                f"{folder / 'tasks.npz'}: {name} has shape {list(array.shape)}, "
+                f"the results are of {sizes['N']} tasks"
+            )
+    return Results(
+        **{name: arrays[name] for name in AXES}, tasks=tasks, config=config, summary=summary
+    )
+
+
+def _load_arrays(path: Path) -> dict[str, np.ndarray]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return dict(file)
+    # TypeError: a lone array, whatever the name of its file says
+    except (OSError, EOFError, TypeError, ValueError, zipfile.BadZipFile, zipfile.zlib.error):
+        raise DataError(f"{path} is not a readable npz file") from None
+
+
+def _load_object(path: Path) -> dict[str, Any]:
+    try:
+        value = json.loads(path.read_text())
+    except ValueError:
+        raise DataError(f"{path} is not readable JSON") from None
+    if not isinstance(value, dict):
+        raise DataError(f"{path} does not hold a JSON object")
+    return value
+
+
+Args = ParamSpec("Args")
+
+
+def styled(draw: Callable[Args, Figure]) -> Callable[Args, Figure]:
+    """Draw in ``STYLE`` without touching the settings of the process."""
+
+    @wraps(draw)
+    def wrapper(*args: Args.args, **kwargs: Args.kwargs) -> Figure:
+        with mpl.rc_context(STYLE):
+            return draw(*args, **kwargs)
+
+    return wrapper
+
+
+def method_styles(labels: Iterable[str]) -> dict[str, tuple[str, str, Any, str]]:
+    """(legend, color, line style, marker) of each label, a method's name or "name (remark)"."""
+    styles: dict[str, tuple[str, str, Any, str]] = {}
+    taken: set[str] = set()
+    spare = iter(SPARE_COLORS * 10)
+    for label in labels:
+        method, _, remark = label.partition(" ")
+        name, color, line, marker = METHODS.get(method, (method, "", "-", "o"))
+        color = next(spare) if color in taken or not color else color
+        taken.add(color)
+        styles[label] = (f"{name} {remark}".strip(), color, line, marker)
+    return styles
+
+
+@styled
+def learning_curve(results: Mapping[str, Results], title: str | None = None) -> Figure:
+    """Figures 6 and 7: return of the optimized prompt over the episodes of adaptation.
+
+    Lines are means over tasks and seeds, bands the standard deviation over seeds.
+    """
+    figure = Figure(figsize=(3.6, 2.7), layout="constrained")
+    ax = figure.add_subplot()
+    for label, (name, color, line, marker) in method_styles(results).items():
+        result = results[label]
+        by_seed = result.eval_returns.mean(axis=1)
+        mean, std = by_seed.mean(axis=0), by_seed.std(axis=0)
+        episodes = result.eval_episodes
+        ax.plot(
+            episodes, mean, label=name, color=color, linestyle=line, marker=marker,
+            markeredgecolor="white", markeredgewidth=0.6,
+        )  # fmt: skip
+        if len(by_seed) > 1:
+            ax.fill_between(episodes, mean - std, mean + std, color=color, alpha=0.16, linewidth=0)
+    optima = {round(float(result.optimal_returns.mean()), 6) for result in results.values()}
+    for index, optimum in enumerate(sorted(optima)):
+        label = "_" if index else "optimum"
+        ax.axhline(optimum, color=INK, linestyle=(0, (4, 3)), linewidth=1.0, label=label, zorder=1)
+    ax.set(xlabel="episodes", ylabel="return of the optimized prompt", title=title or "")
+    ax.set_xlim(left=0)
+    ax.margins(y=0.08)
+    ax.legend(loc="best")
+    return figure
+
+
+@styled
+def prompts_on_mazes(
+    results: Mapping[str, Results],
+    tasks: Mapping[str, np.ndarray],
+    which: Sequence[int] = (0, 1, 2, 3),
+    seed: int = 0,
+) -> Figure:
+    """Figure 2: the final prompt of each method, in its color, on a few tasks."""
+    styles = method_styles(results)
+    figure, axes = _maze_grid(1, len(which))
+    prompts = [
+        {
+            color: goals_of(results[label].best_prompt(seed, index))
+            for label, (_, color, *_) in styles.items()
+        }
+        for index in which
+    ]
+    _draw_tasks(axes[0], tasks, which, prompts, [None] * len(which))
+    handles = [
+        Line2D([], [], color=color, marker="o", linestyle="", markersize=6, label=name)
+        for name, color, *_ in styles.values()
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+    return figure
+
+
+@styled
+def evolution(
+    env: Environment,
+    policy: Policy,
+    results: Results,
+    task: int,
+    seed: int = 0,
+    stages: Sequence[int] = STAGES,
+    key: jax.Array | None = None,
+) -> Figure:
+    """Figures 3 and 10: the best prompt after some episodes, and where it leads the policy."""
+    key = jax.random.key(0) if key is None else key
+    stages = [stage for stage in stages if stage <= results.returns.shape[2]]
+    prompts = [results.best_prompt(seed, task, stage) for stage in stages]
+    runs = [run_policy(key, env, policy, task_at(results.tasks, task), p) for p in prompts]
+    visits = [visit_counts(episodes, results.tasks["maze"][task]) for episodes in runs]
+
+    figure, axes = _maze_grid(1, len(stages), colorbar=True)
+    norm = visit_norm(*visits)
+    goals = [{PROMPT_COLOR: goals_of(prompt)} for prompt in prompts]
+    _draw_tasks(axes[0], results.tasks, [task] * len(stages), goals, visits, norm)
+    for ax, stage, episodes in zip(axes[0], stages, runs, strict=True):
+        ax.set_title(_title(stage, "episode", episodes))
+    _visit_bar(figure, axes, norm)
+    return figure
+
+
+@styled
+def short_and_long(
+    env: Environment,
+    policy: Policy,
+    tasks: Mapping[str, np.ndarray],
+    key: jax.Array | None = None,
+) -> Figure:
+    """Figure 9: behavior under the task goal alone, and under the longest prompts.
+
+    Long prompts are drawn from the best of the trajectories above them.
+    """
+    num_tasks = len(tasks["maze"])
+    keys = jax.random.split(jax.random.key(0) if key is None else key, (num_tasks, 3))
+    pairs: list[tuple[Prompt, Episode]] = []  # short and long of each task in turn
+    for index, (key_short, key_draw, key_long) in enumerate(keys):
+        task = task_at(tasks, index)
+        goal = env.task_goal(task)
+        short = single_goal(goal, policy.num_slots)
+        exploring = run_policy(key_short, env, policy, task, short)
+        long = longest_prompt(key_draw, exploring, goal, policy.num_slots)
+        exploiting = run_policy(key_long, env, policy, task, long)
+        pairs += [(short, exploring), (long, exploiting)]
+
+    figure, axes = _maze_grid(2, num_tasks, colorbar=True)
+    flat, which = list(axes.T.flat), list(np.arange(num_tasks).repeat(2))
+    visits = [
+        visit_counts(episodes, tasks["maze"][index])
+        for index, (_, episodes) in zip(which, pairs, strict=True)
+    ]
+    norm = visit_norm(*visits)
+    goals = [{PROMPT_COLOR: goals_of(prompt)} for prompt, _ in pairs]
+    _draw_tasks(flat, tasks, which, goals, visits, norm)
+    for ax, (prompt, episodes) in zip(flat, pairs, strict=True):
+        ax.set_title(_title(int(prompt.mask.sum()), "goal", episodes))
+    _visit_bar(figure, axes, norm)
+    return figure
+
+
+@partial(jax.jit, static_argnames=("env", "policy"))
+def run_policy(
+    key: jax.Array,
+    env: Environment,
+    policy: Policy,
+    task: Any,
+    prompt: Prompt,
+    greedy: bool | jax.Array = False,
+) -> Episode:
+    """``NUM_ROLLOUTS`` episodes under one prompt."""
+    query = Query(prompt, jnp.asarray(greedy))
+    episode = jax.vmap(lambda k: rollout(k, env, policy, task, query, "lanes"), axis_name="lanes")
+    return episode(jax.random.split(key, NUM_ROLLOUTS))
+
+
+def positions_of(episode: Episode, side: int) -> list[np.ndarray]:
+    """The cells after each step, ``[length, 2]`` for each of a batch of maze episodes."""
+    cells = np.rint(np.asarray(episode.trajectory.goals) * side).astype(int)
+    lengths = np.asarray(episode.trajectory.length)
+    return [walk[:length] for walk, length in zip(cells, lengths, strict=True)]
+
+
+def visit_counts(episode: Episode, maze: np.ndarray) -> np.ndarray:
+    """Mean visits of each cell in one of a batch of maze episodes, the start included."""
+    walks = positions_of(episode, len(maze))
+    cells = np.concatenate([*walks, np.tile(start_of(maze), (len(walks), 1))])
+    counts = np.zeros(maze.shape)
+    np.add.at(counts, tuple(cells.T), 1.0)
+    return counts / len(walks)
+
+
+def goals_of(prompt: Prompt) -> np.ndarray:
+    """The goals of one prompt, ``[k, G]``."""
+    return np.asarray(prompt.goals)[np.asarray(prompt.mask)]
+
+
+def start_of(maze: np.ndarray) -> tuple[int, int]:
+    return MazeRunner(name="plot", side=len(maze), horizon=1).start
+
+
+def task_at(tasks: Mapping[str, np.ndarray], index: int) -> MazeTask:
+    return MazeTask(jnp.asarray(tasks["maze"][index]), jnp.asarray(tasks["goal"][index]))
+
+
+def longest_prompt(
+    key: jax.Array, episodes: Episode, goal: jax.Array, num_slots: int, num_draws: int = 64
+) -> Prompt:
+    """A prompt with as many goals as fit, drawn from the best of some episodes."""
+    at = int(episodes.return_.argmax())
+    best = jax.tree.map(lambda leaf: leaf[at], episodes.trajectory)
+    draw = jax.vmap(lambda k: sample_prompt(k, best, goal, num_slots))
+    drawn = draw(jax.random.split(key, num_draws))
+    longest = int(drawn.mask.sum(axis=1).argmax())
+    return jax.tree.map(lambda leaf: leaf[longest], drawn)
+
+
+def _maze_grid(rows: int, columns: int, colorbar: bool = False) -> tuple[Figure, np.ndarray]:
+    size = (PANEL * columns + (0.6 if colorbar else 0.0), (PANEL + 0.2) * rows)
+    figure = Figure(figsize=size, layout="compressed")
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def _draw_tasks(
+    axes: Sequence[Any],
+    tasks: Mapping[str, np.ndarray],
+    which: Sequence[int],
+    prompts: Sequence[Mapping[str, np.ndarray]],
+    visits: Sequence[np.ndarray | None],
+    norm: PowerNorm | None = None,
+) -> None:
+    """Draw one task on each of some axes, all with a bar of the same width."""
+    side = tasks["maze"].shape[1]
+    lanes = max(bar_lanes(side, by_color.values()) for by_color in prompts)
+    for ax, index, by_color, counts in zip(axes, which, prompts, visits, strict=True):
+        maze, goal = tasks["maze"][index], tasks["goal"][index]
+        draw_maze(ax, maze, start_of(maze), goal, by_color, visits=counts, norm=norm, lanes=lanes)
+
+
+def _title(count: int, what: str, episodes: Episode) -> str:
+    mean = f"{float(episodes.return_.mean()):.2f}".replace("-", "\N{MINUS SIGN}")
+    return f"{count} {what}{'' if count == 1 else 's'}  (return {mean})"
+
+
+def _visit_bar(figure: Figure, axes: np.ndarray, norm: PowerNorm) -> None:
+    bar = figure.colorbar(
+        visit_scale(norm), ax=axes, label="visits in an episode", fraction=0.03, pad=0.01, aspect=25
+    )
+    bar.outline.set_visible(False)
+
+
+@dataclass(frozen=True)
+class PlotConfig(Common):
+    """Settings of ``experiments.plot``."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Result folders of adaptations; those of one world share its figures."""
+    out: Path = Path("figures")
+    """Folder to write."""
+    tasks: tuple[int, ...] = (0, 1, 2, 3)
+    """Tasks to draw on mazes, counted from 0."""
+    seed: int = 0
+    """Which seed of the adaptations to draw on mazes, counted from 0."""
+
+
+def main(config: PlotConfig) -> None:
+    """Draw every figure that the results of some adaptations allow."""
+    if not config.runs:
+        raise UsageError("no result folder given; usage: python -m experiments.plot RUN_DIR ...")
+    by_env: dict[str, dict[Path, Results]] = {}
+    for folder in dict.fromkeys(config.runs):
+        result = load_results(folder)
+        by_env.setdefault(result.config["env"], {})[folder] = result
+    for folders in by_env.values():
+        _check_together(config, folders)
+
+    config.out.mkdir(parents=True, exist_ok=True)
+    for env_name, folders in by_env.items():
+        results = label_runs(folders)
+        _save(learning_curve(results, env_name), config.out / f"{env_name}_learning_curve.png")
+        if "maze" in next(iter(results.values())).tasks:
+            _draw_mazes(config, env_name, results)
+
+
+def label_runs(folders: Mapping[Path, Results]) -> dict[str, Results]:
+    """Results by method name, and folder where one method ran more than once."""
+    methods = [result.config["bandit"] for result in folders.values()]
+    labels = [
+        method if methods.count(method) == 1 else f"{method} ({folder})"
+        for method, folder in zip(methods, folders, strict=True)
+    ]
+    return dict(zip(labels, folders.values(), strict=True))
+
+
+def _check_together(config: PlotConfig, folders: Mapping[Path, Results]) -> None:
+    """Raise ``UsageError`` for runs that no figure can compare, or that lack what is asked for."""
+    first_folder, first = next(iter(folders.items()))
+    for folder, result in folders.items():
+        same = result.tasks.keys() == first.tasks.keys() and all(
+            np.array_equal(array, first.tasks[name]) for name, array in result.tasks.items()
+        )
+        if not same:
+            raise UsageError(
+                f"{folder} and {first_folder} ran on different tasks; plot them one at a time"
+            )
+        if not 0 <= config.seed < len(result.returns):
+            raise UsageError(f"--seed {config.seed}: {folder} has {len(result.returns)} seeds")
+
+
+def _draw_mazes(config: PlotConfig, env_name: str, results: Mapping[str, Results]) -> None:
+    """Figures 2, 3, 9 and 10, and a GIF of the first task under the optimized prompt."""
+    from experiments.policies import load_policy
+
+    out, seed = config.out, config.seed
+    tasks = next(iter(results.values())).tasks
+    which = [index for index in config.tasks if 0 <= index < len(tasks["maze"])]
+    if not which:
+        raise UsageError(f"--tasks: {env_name} has the tasks 0 to {len(tasks['maze']) - 1}")
+    _save(prompts_on_mazes(results, tasks, which, seed), out / f"{env_name}_prompts.png")
+
+    chosen = {name: array[which] for name, array in tasks.items()}
+    key = jax.random.key(seed)
+    drawn = set()
+    for number, result in enumerate(results.values()):
+        path = result.config.get("policy")
+        env, policy = load_policy(env_name, path and Path(path))
+        method = result.config["bandit"]
+        name = f"{env_name}_{method}" + (f"_{number}" if method in drawn else "")
+        if not drawn:
+            _save(short_and_long(env, policy, chosen, key), out / f"{env_name}_short_and_long.png")
+        drawn.add(method)
+        for task in which:
+            figure = evolution(env, policy, result, task, seed, key=key)
+            _save(figure, out / f"{name}_evolution_task{task}.png")
+
+        task, maze = which[0], tasks["maze"][which[0]]
+        prompt = result.best_prompt(seed, task)
+        episode = run_policy(key, env, policy, task_at(tasks, task), prompt, greedy=True)
+        walk = positions_of(episode, len(maze))[0]
+        gif = out / f"{name}_episode_task{task}.gif"
+        maze_gif(gif, maze, start_of(maze), tasks["goal"][task], walk, goals_of(prompt))
+        print(gif)
+
+
+def _save(figure: Figure, path: Path) -> None:
+    with mpl.rc_context(STYLE):
+        figure.savefig(path)
+    print(path)
+
+
+if __name__ == "__main__":
+    run(PlotConfig, main)

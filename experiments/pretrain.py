@@ -1,0 +1,252 @@
+"""Pre-train a policy: ``python -m experiments.pretrain --env maze15``."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import fields, replace
+from functools import partial
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from envs.base import Environment
+from experiments.collect import CollectConfig, dataset_folder, find_demonstrator
+from experiments.collect import main as collect_main
+from experiments.configs import PretrainConfig, make_env, positive, pretrain_default
+from experiments.runtime import new_folder, provenance, run, to_json, write_json
+from experiments.tasks import EVAL_SEED, benchmark_tasks, sample_tasks, task_hashes
+from mgpo_jax.adapt import evaluate
+from mgpo_jax.checkpoint import (
+    checkpoints,
+    network_config,
+    restore_state,
+    save_policy,
+    save_state,
+)
+from mgpo_jax.dataset import Dataset, load_dataset
+from mgpo_jax.errors import DataError, UsageError
+from mgpo_jax.policy import transformer_policy
+from mgpo_jax.pretrain import batch_stream, make_trainer
+from mgpo_jax.prompts import single_goal
+from mgpo_jax.sharding import device_mesh, largest_divisor
+from mgpo_jax.transformer import TransformerConfig
+
+LANES = "lanes"
+
+
+class Metrics:
+    """Appends rows to ``metrics.jsonl`` and, if asked, to TensorBoard and Weights & Biases."""
+
+    def __init__(self, folder: Path, config: PretrainConfig, first_step: int) -> None:
+        self.path = folder / "metrics.jsonl"
+        rows = self.path.read_text().splitlines() if self.path.exists() else []
+        # A resumed run writes again what came after its checkpoint.
+        kept = [row for row in rows if json.loads(row)["step"] <= first_step]
+        self.path.write_text("".join(row + "\n" for row in kept))
+        self.writers: list[Callable[[dict[str, float], int], Any]] = []
+        if config.tb:
+            board = _optional("tensorboardX", "tb").SummaryWriter(str(folder / "tensorboard"))
+            self.writers.append(
+                lambda row, step: [board.add_scalar(k, v, step) for k, v in row.items()]
+            )
+        if config.wandb:
+            wandb = _optional("wandb", "wandb")
+            wandb.init(project="mgpo-jax", name=str(folder), config=to_json(config))
+            self.writers.append(lambda row, step: wandb.log(row, step=step))
+
+    def write(self, step: int, row: dict[str, float]) -> None:
+        with open(self.path, "a") as file:
+            file.write(json.dumps({"step": step, **row}) + "\n")
+        for writer in self.writers:
+            writer(row, step)
+
+
+def _optional(module: str, extra: str) -> Any:
+    try:
+        return __import__(module)
+    except ImportError:
+        raise UsageError(
+            f'{module} is not installed; run `pip install "mgpo-jax[{extra}]"`'
+        ) from None
+
+
+def prepare_dataset(config: PretrainConfig, env: Environment) -> Dataset:
+    """The run's dataset, collected first where it is not there yet; no test task is in it."""
+    policy, _ = find_demonstrator(env, config.data.demonstrator)
+    wanted = CollectConfig(
+        env=config.env, policy=policy, episodes=config.data.episodes, seed=config.data.data_seed
+    )
+    folder = dataset_folder(wanted, policy)
+    if not folder.exists():
+        print(f"no dataset in {folder} yet: collecting {wanted.episodes} episodes", file=sys.stderr)
+        collect_main(wanted)
+    dataset, _ = load_dataset(folder, env.spec)
+    if np.isin(dataset.task_hashes, task_hashes(env, benchmark_tasks(env))).any():
+        raise DataError(f"{folder} holds a test task; remove it and collect it again")
+    if config.holdout >= len(dataset):
+        raise UsageError(
+            f"--holdout {config.holdout} leaves nothing of {len(dataset)} trajectories"
+        )
+    return dataset
+
+
+def greedy_evaluation(
+    env: Environment, network: TransformerConfig, num: int
+) -> Callable[[Any], dict[str, float]]:
+    """``params -> mean greedy return and regret of the prompt (g^M)`` on tasks of its own."""
+    tasks = sample_tasks(env, EVAL_SEED, num)
+    optimum = jax.jit(jax.vmap(env.optimal_return))(tasks)
+
+    @jax.jit
+    @partial(jax.vmap, in_axes=(None, 0, 0), axis_name=LANES)
+    def returns(params: Any, key: jax.Array, task: Any) -> jax.Array:
+        policy = transformer_policy(network, params)
+        prompt = single_goal(env.task_goal(task), policy.num_slots)
+        return evaluate(key, env, policy, task, prompt, LANES).return_
+
+    def measure(params: Any) -> dict[str, float]:
+        found = returns(params, jax.random.split(jax.random.key(EVAL_SEED), num), tasks)
+        regret = jnp.mean(optimum - found)
+        return {"eval/initial_return": float(found.mean()), "eval/initial_regret": float(regret)}
+
+    return measure
+
+
+@contextmanager
+def stop_request() -> Iterator[Callable[[], bool]]:
+    """Turns Ctrl-C and SIGTERM into a request that is met between two gradient steps."""
+    asked: list[int] = []
+
+    def ask(number: int, frame: FrameType | None) -> None:
+        if asked:
+            raise KeyboardInterrupt  # the second time, at once
+        asked.append(number)
+
+    before = {s: signal.signal(s, ask) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(asked)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def open_run(config: PretrainConfig) -> Path:
+    """The run folder: a new one, or with ``--resume`` one made with the same settings."""
+    folder = config.folder
+    saved = folder / "config.json"
+    if not config.resume:
+        new_folder(folder, "continue it with --resume", "choose another with --out")
+        write_json(saved, config)
+        write_json(folder / "meta.json", provenance())
+        return folder
+    if not saved.is_file():
+        raise UsageError(f"no run to resume in {folder}; start it without --resume")
+    try:
+        before = json.loads(saved.read_text())
+    except ValueError:
+        raise DataError(f"{saved} is not readable JSON") from None
+    now = to_json(replace(config, resume=False, debug=False))
+    before = {**before, "debug": False}
+    changed = [
+        f"{name} {before.get(name)} -> {now[name]}" for name in now if now[name] != before.get(name)
+    ]
+    if changed:
+        raise UsageError(f"{folder} was started with other settings: {'; '.join(changed)}")
+    return folder
+
+
+def main(config: PretrainConfig) -> None:
+    """Pre-train the multi-goal Transformer on hindsight prompts."""
+    positive(config.data, "episodes")
+    positive(config.train, "steps", "batch_size", "part_size", "bucket")
+    positive(config, "max_prompt_length", "eval_tasks", "eval_every", "save_every", "holdout")
+    if config.train.batch_size % config.train.part_size:
+        raise UsageError(
+            f"--batch-size {config.train.batch_size} is not a multiple of --part-size "
+            f"{config.train.part_size}"
+        )
+    env = make_env(config.env)
+    network = network_config(
+        env.spec,
+        **{name: getattr(config, name) for name in _names(TransformerConfig, PretrainConfig)},
+    )
+    dataset = prepare_dataset(config, env)
+    folder = open_run(config)
+
+    train = config.train
+    mesh = device_mesh(largest_divisor(train.part_size, len(jax.devices())))
+    fit, held_out = (
+        dataset.slice(0, len(dataset) - config.holdout),
+        dataset.slice(len(dataset) - config.holdout, len(dataset)),
+    )
+    trainer = make_trainer(train, network, fit, mesh)
+    validate = make_trainer(train, network, held_out, mesh).evaluate
+    evaluate_greedily = greedy_evaluation(env, network, config.eval_tasks)
+    # Two batches of one padded length: the validation loss is of the same draws every time.
+    part = replace(train, batch_size=512, part_size=64, bucket=env.spec.horizon)
+    truncate = env.spec.truncate_in_hindsight
+    held_out_parts = next(batch_stream(part, held_out, truncate))
+
+    with checkpoints(folder / "checkpoints") as manager, stop_request() as stopping:
+        state = trainer.init()
+        if config.resume:
+            state = restore_state(manager, state) or state
+            print(f"resuming {folder} at step {state.step}", file=sys.stderr)
+        metrics = Metrics(folder, config, state.step)
+        batches = batch_stream(train, fit, truncate, first_step=state.step)
+        progress = tqdm(total=train.steps, initial=state.step, unit="step", disable=None)
+        pending: list[dict[str, jax.Array]] = []
+        clock = time.process_time()
+        while state.step < train.steps:
+            state, row = trainer.step(state, next(batches))
+            pending.append(row)
+            progress.update()
+            done = state.step == train.steps
+            if stopping() or done or state.step % config.save_every == 0:
+                save_state(manager, state)
+            if done or state.step % config.eval_every == 0:
+                rows = jax.device_get(pending)
+                mean = {f"train/{k}": float(np.mean([r[k] for r in rows])) for k in rows[0]}
+                spent = {"cpu_seconds_per_step": (time.process_time() - clock) / len(rows)}
+                held = {f"val/{k}": v for k, v in validate(state.params, held_out_parts).items()}
+                row_out = {**mean, **held, **evaluate_greedily(state.params), **spent}
+                metrics.write(state.step, row_out)
+                progress.set_postfix(
+                    loss=f"{mean['train/loss']:.3f}",
+                    val=f"{held['val/loss']:.3f}",
+                    initial=f"{row_out['eval/initial_return']:.2f}",
+                )
+                pending, clock = [], time.process_time()
+            if stopping():
+                progress.close()
+                print(f"stopped at step {state.step}; continue with --resume", file=sys.stderr)
+                raise KeyboardInterrupt
+        progress.close()
+
+    made = {"env": config.env, "config": to_json(config), "steps": state.step}
+    save_policy(folder / "policy", network, state.params, made)
+    from experiments.plot import training_curve
+
+    training_curve(folder / "metrics.jsonl").savefig(folder / "training.png")
+    print(f"policy written to {folder / 'policy'}", file=sys.stderr)
+
+
+def _names(*classes: type) -> list[str]:
+    """Field names that dataclasses have in common."""
+    common = set.intersection(*({f.name for f in fields(c)} for c in classes))
+    return sorted(common)
+
+
+if __name__ == "__main__":
+    run(tyro.conf.OmitArgPrefixes[PretrainConfig], main, pretrain_default)

@@ -1,0 +1,100 @@
+"""Release a trained policy: ``python -m experiments.release runs/pretrain/maze15/fast-seed0``.
+
+Puts weights, config, the world's test tasks and a model card into ``pretrained/ENV``, where every
+other command finds them by default.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from experiments.configs import PRETRAINED, make_env
+from experiments.runtime import Common, new_folder, run
+from experiments.tasks import benchmark_tasks, save_tasks
+from mgpo_jax.checkpoint import CONFIG, WEIGHTS, load_policy_files
+from mgpo_jax.errors import UsageError
+
+
+@dataclass(frozen=True)
+class ReleaseConfig(Common):
+    """Settings of ``experiments.release``."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder of a finished pre-training run."""
+    out: Path | None = None
+    """Folder to write (default: pretrained/ENV)."""
+
+
+CARD = """# Multi-goal Transformer for {env}
+
+| | |
+| --- | --- |
+| network | {num_layers} layers, width {embed_dim}, {num_heads} head(s), {num_weights:,} weights |
+| prompts | up to {max_prompt_length} goals, {order} |
+| data | {episodes:,} demonstrations, seed {data_seed} |
+| training | {steps:,} gradient steps of {batch_size} trajectories, {cpu_minutes:.0f} CPU-minutes |
+| validation loss | {val_loss:.4f} nats an action, accuracy {val_accuracy:.4f} |
+| greedy return of the prompt (g^M) | {initial:.3f} on {eval_tasks} tasks of the training's own |
+
+Made by
+
+    {command}
+
+Files: `weights.npz`, `config.json` (network, SHA-256 of the weights, all settings), `tasks.npz` (the
+test tasks, in no dataset). Results on them are in `results/` and the README.
+"""
+
+
+def main(config: ReleaseConfig) -> None:
+    """Package a finished pre-training run as a released policy."""
+    source = config.run / "policy"
+    if not source.is_dir():
+        raise UsageError(f"{config.run} has no finished policy; let its training end first")
+    network, params, made = load_policy_files(source)
+    env = make_env(made["env"])
+    folder = new_folder(
+        config.out or PRETRAINED / made["env"], "remove it", "choose another with --out"
+    )
+    for name in (WEIGHTS, CONFIG):
+        shutil.copy(source / name, folder / name)
+    save_tasks(folder / "tasks.npz", benchmark_tasks(env))
+    rows = [json.loads(row) for row in (config.run / "metrics.jsonl").read_text().splitlines()]
+    settings, last = made["config"], rows[-1]
+    steps_between = [
+        b["step"] - a for a, b in zip([0, *(r["step"] for r in rows)], rows, strict=False)
+    ]
+    cpu = sum(r["cpu_seconds_per_step"] * n for r, n in zip(rows, steps_between, strict=True))
+    meta = json.loads((config.run / "meta.json").read_text())
+    import jax
+
+    text = CARD.format(
+        env=made["env"],
+        num_layers=network.num_layers,
+        embed_dim=network.embed_dim,
+        num_heads=network.num_heads,
+        num_weights=sum(leaf.size for leaf in jax.tree.leaves(params)),
+        max_prompt_length=network.max_prompt_length,
+        order="with an order embedding" if network.prompt_order else "without an order embedding",
+        episodes=settings["data"]["episodes"],
+        data_seed=settings["data"]["data_seed"],
+        steps=made["steps"],
+        batch_size=settings["train"]["batch_size"],
+        cpu_minutes=cpu / 60,
+        val_loss=last["val/loss"],
+        val_accuracy=last["val/accuracy"],
+        initial=last["eval/initial_return"],
+        eval_tasks=settings["eval_tasks"],
+        command=" ".join(meta["command"]),
+    )
+    (folder / "README.md").write_text(text)
+    print(f"released in {folder}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    run(ReleaseConfig, main)

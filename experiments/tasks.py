@@ -1,0 +1,74 @@
+"""Task sets: the fixed test tasks of each world, and a user's own."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from envs.base import Environment, Task
+from mgpo_jax.dataset import hash_task
+from mgpo_jax.errors import DataError, UsageError
+
+# Streams of task seeds that never meet: test, evaluation while training; data seeds count from 0.
+TEST_SEED, EVAL_SEED = 1_000_003, 1_000_033
+NUM_TEST_TASKS = 50
+
+
+def sample_tasks(env: Environment, seed: int, num: int) -> Task:
+    """``num`` random tasks, stacked on a leading axis."""
+    return jax.jit(jax.vmap(env.sample_task))(jax.random.split(jax.random.key(seed), num))
+
+
+def benchmark_tasks(env: Environment, num: int = NUM_TEST_TASKS) -> Task:
+    """The test tasks of a world: the same for everyone, and in no dataset."""
+    return sample_tasks(env, TEST_SEED, num)
+
+
+def task_hashes(env: Environment, tasks: Task) -> np.ndarray:
+    """A hash of each task's fingerprint, [N] uint64."""
+    prints = np.asarray(jax.vmap(env.fingerprint)(tasks))
+    return np.array([hash_task(one) for one in prints], np.uint64)
+
+
+def num_tasks(tasks: Task) -> int:
+    return len(jax.tree.leaves(tasks)[0])
+
+
+def save_tasks(path: Path, tasks: Task) -> None:
+    np.savez_compressed(path, allow_pickle=False, **jax.tree.map(np.asarray, tasks._asdict()))
+
+
+def load_tasks(path: Path, env: Environment) -> Task:
+    """Read tasks from an npz file with one array for each field of the world's task.
+
+    Raises:
+      UsageError: if there is no such file.
+      DataError: if it cannot be read or holds something that is no task.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UsageError(f"no task file {path}")
+    example: Any = jax.eval_shape(env.sample_task, jax.random.key(0))
+    fields = type(example)._fields
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = dict(file)
+    except (OSError, ValueError, zipfile.BadZipFile):
+        raise DataError(f"{path} is not a readable npz file") from None
+    if missing := [name for name in fields if name not in arrays]:
+        raise DataError(
+            f"{path} lacks {', '.join(missing)}; tasks of {env.spec.name} need the arrays "
+            f"{', '.join(fields)}"
+        )
+    tasks = type(example)(*(arrays[name] for name in fields))
+    if len(tasks[0]) == 0:
+        raise DataError(f"{path} holds no tasks")
+    try:
+        env.check_task(tasks)
+    except ValueError as error:
+        raise DataError(f"{path}: {error}") from None
+    return jax.tree.map(lambda array, like: array.astype(like.dtype), tasks, example)

@@ -1,0 +1,304 @@
+"""The command lines: errors that help, nothing overwritten, an interrupted run that goes on."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+import tyro
+
+import envs
+from experiments import adapt, collect, pretrain, runtime
+from experiments.adapt import AdaptConfig
+from experiments.collect import CollectConfig
+from experiments.configs import PretrainConfig, pretrain_default, pretrain_preset
+from experiments.tasks import benchmark_tasks, load_tasks, sample_tasks, save_tasks, task_hashes
+from mgpo_jax.checkpoint import load_policy_files
+from mgpo_jax.dataset import load_dataset
+
+Run = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(runtime, "configure", lambda: None)
+    monkeypatch.delenv("MGPO_DATA", raising=False)
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Runs a command in this process; returns its exit code and what it wrote to stderr."""
+    mains: dict[str, tuple[Any, ...]] = {
+        "collect": (CollectConfig, collect.main),
+        "pretrain": (tyro.conf.OmitArgPrefixes[PretrainConfig], pretrain.main, pretrain_default),
+        "adapt": (tyro.conf.OmitArgPrefixes[AdaptConfig], adapt.main),
+    }
+
+    def call(line: str) -> tuple[int, str]:
+        name, *words = line.split()
+        monkeypatch.setattr(sys, "argv", [name, *words])
+        with pytest.raises(SystemExit) as stop:
+            runtime.run(*mains[name])
+        return int(stop.value.code or 0), capsys.readouterr().err
+
+    return call
+
+
+TINY = (
+    "pretrain --preset smoke --episodes 40 --holdout 8 --embed-dim 8 --num-layers 1 --steps 6 "
+    "--batch-size 8 --part-size 4 --bucket 64 --eval-tasks 2 --eval-every 3 --save-every 2"
+)
+
+
+@pytest.fixture(scope="module")
+def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A pre-training run of six steps, with its dataset."""
+    root = tmp_path_factory.mktemp("tiny")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(root)
+        pretrain.main(tyro_config(TINY))
+    return root
+
+
+def tyro_config(line: str) -> PretrainConfig:
+    words = line.split()[1:]
+    return tyro.cli(
+        tyro.conf.OmitArgPrefixes[PretrainConfig], args=words, default=pretrain_default(words)
+    )
+
+
+@pytest.fixture
+def workspace(tiny_run: Path, tmp_path: Path) -> Path:
+    """A copy of the tiny run as the current folder."""
+    shutil.copytree(tiny_run, tmp_path, dirs_exist_ok=True)
+    return tmp_path
+
+
+RUN = Path("runs/pretrain/maze15/smoke-seed0")
+POLICY = RUN / "policy"
+
+
+@pytest.mark.parametrize(
+    ("line", "code", "says"),
+    [
+        ("adapt --env maze51", 2, "did you mean 'maze15'"),
+        ("adapt --bandit ubc", 2, "did you mean 'ucb'"),
+        ("adapt --episodes 0", 2, "--episodes must be at least 1"),
+        ("adapt --seeds 0", 2, "--seeds must be at least 1"),
+        ("adapt --bandit bpe --c 2", 2, "--c is no option of bpe"),
+        ("adapt --policy nowhere", 2, "no policy in nowhere"),
+        ("pretrain --env gridwrld", 2, "unknown environment 'gridwrld'"),
+        ("pretrain --preset papr", 2, "did you mean 'paper'"),
+        ("pretrain --steps 0", 2, "--steps must be at least 1"),
+        ("pretrain --resume --out nothing --preset smoke --episodes 0", 2, "--episodes must be"),
+        ("pretrain --policy astar3 --preset smoke", 2, "did you mean 'astar"),
+        ("pretrain --batch-size 10 --part-size 4", 2, "not a multiple"),
+        ("collect --policy astr4", 2, "did you mean 'astar4'"),
+        ("collect --episodes 0", 2, "--episodes must be at least 1"),
+    ],
+)
+def test_usage_errors_name_the_mend(command: Run, line: str, code: int, says: str) -> None:
+    found, text = command(line)
+    assert (found, says in text) == (code, True), text
+    assert "Traceback" not in text
+    assert len(text.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("line", ["adapt --nonsense 1", "adapt --episodes many"])
+def test_unknown_flags_and_values_exit_with_2(command: Run, line: str) -> None:
+    assert command(line)[0] == 2
+
+
+def test_debug_shows_the_traceback(command: Run) -> None:
+    code, text = command("adapt --env maze51 --debug")
+    assert code == 2
+    assert "Traceback" in text
+
+
+def test_unexpected_errors_are_one_line(command: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(collect, "make_env", lambda name: 1 / 0)
+    code, text = command("collect")
+    assert code == 1
+    assert text.startswith("error: ZeroDivisionError")
+    assert "--debug" in text
+    assert "Traceback" not in text
+
+
+def test_existing_folders_are_never_overwritten(command: Run, workspace: Path) -> None:
+    before = {path: path.read_bytes() for path in workspace.rglob("*") if path.is_file()}
+    for line in (TINY, "collect --episodes 40"):
+        code, text = command(line)
+        assert code == 2
+        assert "exists already" in text
+    code, text = command(f"adapt --policy {POLICY} --out runs --episodes 1")
+    assert (code, "exists already" in text) == (2, True)
+    assert before == {path: path.read_bytes() for path in workspace.rglob("*") if path.is_file()}
+
+
+def test_damaged_dataset_is_refused(command: Run, workspace: Path) -> None:
+    arrays = workspace / "data/maze15/astar4-40-seed0/trajectories.npz"
+    arrays.write_bytes(arrays.read_bytes()[:-100])
+    code, text = command(TINY.replace("--steps 6", "--steps 6 --out other"))
+    assert code == 1
+    assert "differs from the hash" in text
+    assert not Path("other").exists()
+
+
+def test_dataset_is_made_by_its_seed_and_holds_no_test_task(command: Run, workspace: Path) -> None:
+    assert command("collect --episodes 40 --out again")[0] == 0
+    env = envs.make("maze15")
+    first, facts = load_dataset(workspace / "data/maze15/astar4-40-seed0", env.spec)
+    second, again = load_dataset(Path("again"), env.spec)
+    for name, array in vars(first).items():
+        np.testing.assert_array_equal(array, getattr(second, name))
+    assert facts["length"] == again["length"]
+    assert facts["num_trajectories"] == 40
+    assert first.lengths.min() >= 20
+    hashes = task_hashes(env, benchmark_tasks(env))
+    assert len(set(hashes)) == 50
+    assert not np.isin(first.task_hashes, hashes).any()
+
+
+def weights(folder: Path) -> Any:
+    return load_policy_files(folder / "policy")[1]
+
+
+def test_resumed_run_equals_an_uninterrupted_one(
+    command: Run, workspace: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C after step 4 saves and exits with 130; --resume then ends in the same bits."""
+
+    @contextmanager
+    def ctrl_c_after_four_steps() -> Iterator[Callable[[], bool]]:
+        asked = iter([False] * 6 + [True] * 9)  # two questions a step
+        yield lambda: next(asked)
+
+    line = f"{TINY} --out second"
+    with monkeypatch.context() as patch:
+        patch.setattr(pretrain, "stop_request", ctrl_c_after_four_steps)
+        code, text = command(line)
+    assert code == 130
+    assert "stopped at step 4; continue with --resume" in text
+    assert not Path("second/policy").exists()
+    code, text = command(f"{line} --resume")
+    assert code == 0, text
+    assert "resuming second at step 4" in text
+    jax.tree.map(np.testing.assert_array_equal, weights(Path("second")), weights(RUN))
+    rows = [
+        [json.loads(row) for row in (run / "metrics.jsonl").read_text().splitlines()]
+        for run in (RUN, Path("second"))
+    ]
+    assert [row["step"] for row in rows[0]] == [row["step"] for row in rows[1]] == [3, 6]
+    for name in ("train/loss", "val/loss", "eval/initial_return"):
+        assert rows[0][0][name] == rows[1][0][name]
+    assert rows[0][1]["val/loss"] == rows[1][1]["val/loss"]
+
+
+def test_resume_refuses_other_settings(command: Run, workspace: Path) -> None:
+    code, text = command(f"{TINY} --resume --learning-rate 0.5")
+    assert code == 2
+    assert "started with other settings" in text
+    assert "0.5" in text
+
+
+def test_resume_without_a_run(command: Run, workspace: Path) -> None:
+    code, text = command(f"{TINY} --resume --out nothing")
+    assert code == 2
+    assert "no run to resume" in text
+
+
+def test_adapt_writes_what_it_prints(
+    command: Run, workspace: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line = (
+        f"adapt --policy {POLICY} --episodes 5 --eval-every 2 --seeds 2 --out result --no-figures"
+    )
+    small = sample_tasks(envs.make("maze15"), 5, 3)
+    save_tasks(Path("mine.npz"), small)
+    code, text = command(f"{line} --tasks mine.npz")
+    assert code == 0, text
+    summary = json.loads(Path("result/summary.json").read_text())
+    raw = np.load("result/results.npz")
+    assert raw["returns"].shape == raw["greedy"].shape == (2, 3, 5)
+    assert raw["prompt_goals"].shape == raw["best_goals"].shape == (2, 3, 5, 5, 2)
+    np.testing.assert_array_equal(raw["eval_episodes"], [1, 2, 4, 5])
+    assert summary["num_tasks"] == 3
+    assert summary["num_seeds"] == 2
+    assert summary["num_episodes"] == 5
+    assert summary["initial_return"] == pytest.approx(raw["returns"][:, :, 0].mean())
+    assert summary["final_return"] == pytest.approx(raw["eval_returns"][:, :, -1].mean())
+    assert summary["regret"] == pytest.approx(
+        (raw["optimal_returns"] - raw["eval_returns"][:, :, -1]).mean()
+    )
+    # Mazes are deterministic: what the search saw is what the evaluation sees.
+    greedy = np.where(raw["greedy"], raw["returns"], -np.inf)
+    np.testing.assert_allclose(
+        np.maximum.accumulate(greedy, axis=-1)[:, :, [0, 1, 3, 4]], raw["eval_returns"], atol=1e-5
+    )
+
+
+def test_prompts_longer_than_trained(command: Run, workspace: Path) -> None:
+    code, text = command(f"adapt --policy {POLICY} --max-goals 6 --out result")
+    assert code == 2
+    assert "longer than the policy's prompts (5 goals)" in text
+
+
+def broken(tasks: Any, **changes: Any) -> dict[str, np.ndarray]:
+    return {**{k: np.array(v) for k, v in tasks._asdict().items()}, **changes}
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda t: {"goal": None}, "lacks goal"),
+        (lambda t: {"maze": t.maze[:, :13]}, "shape [N, 15, 15]"),
+        (lambda t: {"maze": t.maze * 2}, "0 (free) and 1 (wall) only"),
+        (lambda t: {"goal": t.goal * 0}, "is not a free cell"),
+        (lambda t: {"goal": np.full_like(t.goal, 99)}, "is not a free cell"),
+        (lambda t: {"goal": t.goal + 0.5}, "integers"),
+        (lambda t: {"goal": t.goal[:1]}, "shape [2, 2]"),
+        (lambda t: {"maze": t.maze * np.nan}, "0 (free) and 1 (wall) only"),
+    ],
+)
+def test_bad_task_files(
+    command: Run, workspace: Path, change: Callable[[Any], dict[str, Any]], says: str
+) -> None:
+    tasks = jax.tree.map(np.asarray, sample_tasks(envs.make("maze15"), 5, 2))
+    arrays = {k: v for k, v in broken(tasks, **change(tasks)).items() if v is not None}
+    np.savez("bad.npz", **arrays)
+    code, text = command(f"adapt --policy {POLICY} --tasks bad.npz --out result")
+    assert code == 1, text
+    assert says in text
+    assert not Path("result").exists()
+
+
+def test_task_file_that_is_missing_or_no_npz(command: Run, workspace: Path) -> None:
+    assert command(f"adapt --policy {POLICY} --tasks none.npz")[0] == 2
+    Path("text.npz").write_text("no")
+    code, text = command(f"adapt --policy {POLICY} --tasks text.npz")
+    assert code == 1
+    assert "not a readable npz" in text
+
+
+def test_tasks_survive_the_file(tmp_path: Path) -> None:
+    env = envs.make("maze15")
+    tasks = benchmark_tasks(env, 4)
+    save_tasks(tmp_path / "tasks.npz", tasks)
+    jax.tree.map(np.testing.assert_array_equal, load_tasks(tmp_path / "tasks.npz", env), tasks)
+
+
+def test_presets_differ_as_they_say() -> None:
+    paper = pretrain_preset("maze15", "paper")
+    assert (paper.train.steps, paper.train.learning_rate, paper.dropout) == (50_000, 1e-4, 0.1)
+    assert (paper.data.episodes, paper.prompt_order) == (10_000, False)
+    assert replace(pretrain_default([]), preset="fast") == pretrain_preset("maze15", "fast")

@@ -1,0 +1,218 @@
+"""The network: causality, padding, the cache against the full pass, sizes, dropout."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mgpo_jax.transformer
+from mgpo_jax.transformer import GoalTransformer, TransformerConfig, grow_cache
+from mgpo_jax.types import Prompt
+
+T, P = 8, 3
+CONFIG = TransformerConfig(
+    obs_dim=3,
+    goal_dim=2,
+    action_dim=4,
+    horizon=T,
+    max_prompt_length=P,
+    embed_dim=16,
+    num_layers=2,
+    dropout=0.0,
+)
+GAUSSIAN = replace(CONFIG, head="gaussian")
+
+
+def make_inputs(config, seed=0):
+    key_goals, key_obs, key_actions = jax.random.split(jax.random.key(seed), 3)
+    prompt = Prompt(
+        jax.random.normal(key_goals, (P, config.goal_dim)), jnp.array([False, True, True])
+    )
+    obs = jax.random.normal(key_obs, (T, config.obs_dim))
+    if config.head == "categorical":
+        actions = jax.random.randint(key_actions, (T,), 0, config.action_dim)
+    else:
+        actions = jax.random.uniform(key_actions, (T, config.action_dim), minval=-1.0)
+    return prompt, obs, actions
+
+
+def make_params(config):
+    """Random weights, larger than the initial ones, with which little would depend on anything."""
+    init = GoalTransformer(config).init
+    shapes = jax.eval_shape(init, jax.random.key(0), *make_inputs(config))
+    rng = np.random.default_rng(0)
+    return jax.tree.map(
+        lambda leaf: jnp.asarray(0.4 * rng.standard_normal(leaf.shape), leaf.dtype), shapes
+    )
+
+
+def make_full(config):
+    """The parameters of the action distributions of all steps, as one array."""
+    network = GoalTransformer(config)
+    return lambda *inputs: jnp.concatenate(network.apply(*inputs), axis=-1)
+
+
+@pytest.fixture(scope="module")
+def params():
+    return make_params(CONFIG)
+
+
+@pytest.fixture(scope="module")
+def full():
+    return jax.jit(make_full(CONFIG))
+
+
+def changed_steps(before, after):
+    return np.flatnonzero(np.abs(np.asarray(before - after)).max(axis=-1) > 0)
+
+
+@pytest.mark.parametrize("t", [0, 3, T - 1])
+def test_the_past_does_not_see_the_future(params, full, t):
+    prompt, obs, actions = make_inputs(CONFIG)
+    before = full(params, prompt, obs, actions)
+    after = full(params, prompt, obs.at[t].add(1.0), actions)
+    np.testing.assert_array_equal(changed_steps(before, after), np.arange(t, T))
+    after = full(params, prompt, obs, actions.at[t].set((actions[t] + 1) % 4))
+    np.testing.assert_array_equal(changed_steps(before, after), np.arange(t + 1, T))
+
+
+def test_gradients_are_causal():
+    params = make_params(GAUSSIAN)
+    prompt, obs, actions = make_inputs(GAUSSIAN)
+
+    @jax.jit
+    @lambda f: jax.jacrev(f, argnums=(0, 1, 2))
+    def jacobians(goals, obs, actions):
+        return make_full(GAUSSIAN)(params, prompt._replace(goals=goals), obs, actions).mean(axis=-1)
+
+    goals, obs, actions = (
+        np.abs(jac).max(axis=-1) > 0 for jac in jacobians(prompt.goals, obs, actions)
+    )
+    steps = np.arange(T)
+    np.testing.assert_array_equal(obs, steps[:, None] >= steps)
+    np.testing.assert_array_equal(actions, steps[:, None] > steps)
+    np.testing.assert_array_equal(goals, np.broadcast_to(prompt.mask, (T, P)))
+
+
+def test_masked_slots_have_no_influence(params, full):
+    prompt, obs, actions = make_inputs(CONFIG)
+    other = prompt._replace(goals=prompt.goals.at[0].set(jnp.array([50.0, -60.0])))
+    np.testing.assert_array_equal(
+        full(params, prompt, obs, actions), full(params, other, obs, actions)
+    )
+
+
+def test_appended_steps_have_no_influence(params, full):
+    prompt, obs, actions = make_inputs(CONFIG)
+    short = full(params, prompt, obs[:5], actions[:5])
+    junk = full(params, prompt, obs.at[5:].set(9.0), actions.at[5:].set(0))
+    np.testing.assert_allclose(short, junk[:5], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("head", "num_heads", "prompt_order"),
+    [
+        ("categorical", 1, True),
+        ("categorical", 2, False),
+        ("gaussian", 1, False),
+        ("gaussian", 2, True),
+    ],
+)
+def test_prefill_and_decode_equal_the_full_pass(head, num_heads, prompt_order):
+    config = replace(CONFIG, head=head, num_heads=num_heads, prompt_order=prompt_order)
+    network = GoalTransformer(config)
+    params = make_params(config)
+
+    def cached(prompt, obs, actions):
+        first, cache = network.apply(params, prompt, obs[0], method="prefill")
+
+        def step(cache, inputs):
+            action, obs = inputs
+            distribution, cache = network.apply(params, cache, action, obs, method="decode")
+            return cache, distribution
+
+        outputs = [jax.tree.map(lambda leaf: leaf[None], first)]
+        # Room is made in unequal pieces, once more than is used.
+        for start, end, room in ((1, 3, 2), (3, T, 6)):
+            cache = grow_cache(cache, 2 * room)
+            cache, more = jax.lax.scan(step, cache, (actions[start - 1 : end - 1], obs[start:end]))
+            outputs.append(more)
+        assert cache.keys[0].shape[1] == P + 1 + 2 * (2 + 6)
+        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *outputs), cache.step
+
+    inputs = [make_inputs(config, seed) for seed in range(3)]
+    inputs[1] = (inputs[1][0]._replace(mask=jnp.array([False, False, True])), *inputs[1][1:])
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *inputs)
+    outputs, steps = jax.jit(jax.vmap(cached))(*batch)
+    expected = jax.jit(jax.vmap(lambda *one: network.apply(params, *one)))(*batch)
+    np.testing.assert_array_equal(steps, T)
+    for found, wanted in zip(outputs, expected, strict=True):
+        np.testing.assert_allclose(found, wanted, atol=1e-5)
+
+
+@pytest.mark.parametrize("block", [3, 5])
+def test_query_blocks_do_not_change_the_result(params, full, monkeypatch, block):
+    inputs = make_inputs(CONFIG)
+
+    monkeypatch.setattr(mgpo_jax.transformer, "QUERY_BLOCK", block)
+    # A new function: the one compiled with whole blocks must not be used again.
+    in_blocks = jax.jit(make_full(CONFIG))(params, *inputs)
+    np.testing.assert_allclose(in_blocks, full(params, *inputs), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("prompt_order", "num_layers", "order_matters"),
+    [
+        (True, 1, True),
+        # One layer of attention sums over the goals. A second one sees what the causal mask did.
+        (False, 1, False),
+        (False, 2, True),
+    ],
+)
+def test_order_of_the_prompt(prompt_order, num_layers, order_matters):
+    config = replace(CONFIG, prompt_order=prompt_order, num_layers=num_layers)
+    prompt, obs, actions = make_inputs(config)
+    prompt = prompt._replace(mask=jnp.ones(P, bool))
+    permuted = prompt._replace(goals=prompt.goals[jnp.array([1, 0, 2])])
+    full = jax.jit(make_full(config))
+    params = make_params(config)
+    difference = full(params, prompt, obs, actions) - full(params, permuted, obs, actions)
+    assert (np.abs(difference).max() > 1e-3) == order_matters
+
+
+@pytest.mark.parametrize(("horizon", "head"), [(64, "categorical"), (500, "gaussian")])
+def test_sizes_of_table_6(horizon, head):
+    config = TransformerConfig(6, 2, 5, horizon, head)
+    network = GoalTransformer(config)
+    float_ = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.float32)  # noqa: E731
+    prompt = Prompt(float_(5, 2), jax.ShapeDtypeStruct((5,), bool))
+    actions = (
+        jax.ShapeDtypeStruct((horizon,), jnp.int32) if head == "categorical" else float_(horizon, 5)
+    )
+    obs = float_(horizon, 6)
+    params = jax.eval_shape(network.init, jax.random.key(0), prompt, obs, actions)
+    outputs = jax.eval_shape(network.apply, params, prompt, obs, actions)
+    assert all(output.shape == (horizon, 5) for output in outputs)
+    count = sum(leaf.size for leaf in jax.tree.leaves(params))
+    assert 0.57e6 < count - horizon * config.embed_dim < 0.63e6
+    assert config.sequence_length == 5 + 2 * horizon - 1
+
+
+def test_dropout_only_when_asked_for(params, full):
+    inputs = make_inputs(CONFIG)
+    network = GoalTransformer(replace(CONFIG, dropout=0.5))
+
+    @jax.jit
+    def noisy(seed):
+        rngs = {"dropout": jax.random.key(seed)}
+        return network.apply(params, *inputs, False, rngs=rngs).logits
+
+    calm = full(params, *inputs)
+    np.testing.assert_allclose(jax.jit(network.apply)(params, *inputs).logits, calm, atol=1e-6)
+    assert np.abs(noisy(0) - noisy(1)).max() > 1e-3
+    assert np.abs(noisy(0) - calm).max() > 1e-3
+    np.testing.assert_array_equal(noisy(0), noisy(0))
