@@ -18,6 +18,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, PowerNorm, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
+from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, FancyBboxPatch, Patch, PathPatch, Rectangle
 from matplotlib.textpath import TextPath
 from matplotlib.transforms import Affine2D
@@ -125,8 +126,7 @@ def draw_maze(
     ax.imshow(_cell_colors(maze, visits, norm), interpolation="nearest", zorder=0)
     for path in paths or ():
         rows, columns = np.asarray(path, float).reshape(-1, 2).T
-        style = {"solid_capstyle": "round", "solid_joinstyle": "round"}
-        ax.plot(columns, rows, color=AGENT_COLOR, alpha=0.5, linewidth=1.4, zorder=1, **style)
+        ax.plot(columns, rows, color=AGENT_COLOR, alpha=0.5, linewidth=1.4, zorder=1)
     _draw_markers(ax, side, _markers(side, start, goal, prompts), lanes)
 
     right = picture_width(side, lanes) - 0.5
@@ -175,7 +175,7 @@ def _by_color(prompts: np.ndarray | Mapping[str, np.ndarray] | None) -> Mapping[
 
 def _unit(side: int) -> float:
     """Size of markers in cells: one cell and a bit, and more where cells are tiny."""
-    return max(1.0, side / 17)
+    return max(1.0, side / 19)
 
 
 def _markers_in_lane(side: int) -> int:
@@ -218,12 +218,15 @@ def _draw_markers(ax: Axes, side: int, markers: list[_Marker], lanes: int) -> No
     unit = _unit(side)
     inside = [marker for marker in markers if marker.cell is not None]
     homes = np.array([marker.cell for marker in inside], float)
-    centers = spread_apart(homes, gap=unit, limit=side - 1)
+    heavy = np.array([marker.shape == "box" for marker in inside])
+    margin = 0.6 * unit - 0.5  # no marker is cut at the edge
+    centers = spread_apart(homes, heavy, gap=unit, limits=(margin, side - 1 - margin))
     for marker, home, center in zip(inside, homes, centers, strict=True):
         if np.linalg.norm(center - home) > 0.5:
-            line = {"markersize": 2.5, "linewidth": 0.8, "zorder": 2.5}
             ends = np.stack([home, center])
-            ax.plot(ends[:, 1], ends[:, 0], color=INK, marker="o", markevery=[0], **line)
+            line = Line2D(ends[:, 1], ends[:, 0], color=INK, linewidth=0.8, zorder=2.5)
+            line.set(marker="o", markersize=2.5, markevery=[0])
+            ax.add_line(line)
         _draw_marker(ax, marker, center[1], center[0], unit)
 
     if lanes:
@@ -236,23 +239,28 @@ def _draw_markers(ax: Axes, side: int, markers: list[_Marker], lanes: int) -> No
             _draw_marker(ax, marker, x, -0.5 + (row + 0.6) * BAR_ROW * unit, unit)
 
 
-def spread_apart(homes: np.ndarray, gap: float, limit: float, num_steps: int = 300) -> np.ndarray:
-    """Points ``[n, 2]`` near their homes, some ``gap`` from each other and within 0 to ``limit``.
+def spread_apart(
+    homes: np.ndarray, heavy: np.ndarray, gap: float, limits: tuple[float, float]
+) -> np.ndarray:
+    """Points ``[n, 2]`` near their homes, some ``gap`` from each other and within ``limits``.
 
-    Points push each other away until none overlap; those with room around them stay at home.
+    Points push each other away until none overlap; those with room around them stay at home, and
+    ``heavy`` ones give way last.
     """
     # Equal points start apart, each in a direction of its own.
     index = np.arange(len(homes))
     equal = np.all(homes[:, None] == homes[None], axis=-1)
     angle = np.pi + 2.4 * index
     nudge = 0.05 * gap * np.stack([np.sin(angle), np.cos(angle)], axis=1)
-    points = homes + np.where((equal.sum(axis=1) > 1)[:, None], nudge, 0.0)
-    for _ in range(num_steps):
+    shared = equal.sum(axis=1) > 1
+    points = homes + np.where((shared & ~heavy)[:, None], nudge, 0.0)
+    pace = np.where(heavy, 0.02, 0.4)[:, None]
+    for _ in range(300):
         apart = points[:, None] - points[None]
         distance = np.linalg.norm(apart, axis=-1) + np.where(np.eye(len(homes)), np.inf, 1e-9)
         overlap = np.maximum(gap - distance, 0.0)
-        points = points + 0.4 * np.sum(apart / distance[..., None] * overlap[..., None], axis=1)
-        points = np.clip(points, 0.0, limit)
+        points = points + pace * np.sum(apart * (overlap / distance)[..., None], axis=1)
+        points = np.clip(points, *limits)
     return points
 
 

@@ -7,7 +7,9 @@ and behavior evolve, 9 short and long prompts.
 from __future__ import annotations
 
 import json
+import sys
 import zipfile
+import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial, wraps
@@ -45,7 +47,7 @@ NUM_ROLLOUTS = 64
 STAGES = (1, 10, 20, 40, 100)
 PANEL = 1.9  # inches of one maze
 
-STYLE = {
+STYLE: dict[Any, Any] = {
     "figure.dpi": 150,
     "savefig.dpi": 150,
     "font.family": "DejaVu Sans",
@@ -167,7 +169,7 @@ def _load_arrays(path: Path) -> dict[str, np.ndarray]:
         with np.load(path, allow_pickle=False) as file:
             return dict(file)
     # TypeError: a lone array, whatever the name of its file says
-    except (OSError, EOFError, TypeError, ValueError, zipfile.BadZipFile, zipfile.zlib.error):
+    except (OSError, EOFError, TypeError, ValueError, zipfile.BadZipFile, zlib.error):
         raise DataError(f"{path} is not a readable npz file") from None
 
 
@@ -236,6 +238,29 @@ def learning_curve(results: Mapping[str, Results], title: str | None = None) -> 
     ax.set_xlim(left=0)
     ax.margins(y=0.08)
     ax.legend(loc="best")
+    return figure
+
+
+@styled
+def training_curve(metrics: Path) -> Figure:
+    """Losses of a pre-training run and its greedy returns on the way, from ``metrics.jsonl``."""
+    try:
+        rows = [json.loads(line) for line in metrics.read_text().splitlines()]
+        steps = [row["step"] for row in rows]
+    except (OSError, ValueError, TypeError, KeyError):
+        raise DataError(f"{metrics} is missing or not readable JSON lines") from None
+    figure = Figure(figsize=(6.4, 2.4), layout="constrained")
+    panels = (
+        ("loss", {"train/loss": "training", "val/loss": "held out"}),
+        ("return of the initial prompt", {"eval/initial_return": "_"}),
+    )
+    colors = (METHODS["bpe"][1], METHODS["ucb"][1])
+    for ax, (ylabel, names) in zip(figure.subplots(1, 2), panels, strict=True):
+        for (name, label), color in zip(names.items(), colors, strict=False):
+            values = [row.get(name, np.nan) for row in rows]
+            ax.plot(steps, values, color=color, label=label, marker="o", markersize=3)
+        ax.set(xlabel="steps", ylabel=ylabel)
+    figure.axes[0].legend()
     return figure
 
 
@@ -316,7 +341,7 @@ def short_and_long(
         pairs += [(short, exploring), (long, exploiting)]
 
     figure, axes = _maze_grid(2, num_tasks, colorbar=True)
-    flat, which = list(axes.T.flat), list(np.arange(num_tasks).repeat(2))
+    flat, which = list(axes.T.flat), [index for index in range(num_tasks) for _ in range(2)]
     visits = [
         visit_counts(episodes, tasks["maze"][index])
         for index, (_, episodes) in zip(which, pairs, strict=True)
@@ -453,6 +478,16 @@ def main(config: PlotConfig) -> None:
             _draw_mazes(config, env_name, results)
 
 
+def draw_run(folder: Path) -> None:
+    """Draw into the folder of one adaptation what needs no policy."""
+    result = load_results(folder)
+    results = {result.config["bandit"]: result}
+    _save(learning_curve(results, result.config["env"]), folder / "learning_curve.png")
+    if "maze" in result.tasks:
+        which = range(min(4, len(result.tasks["maze"])))
+        _save(prompts_on_mazes(results, result.tasks, which), folder / "prompts.png")
+
+
 def label_runs(folders: Mapping[Path, Results]) -> dict[str, Results]:
     """Results by method name, and folder where one method ran more than once."""
     methods = [result.config["bandit"] for result in folders.values()]
@@ -491,7 +526,7 @@ def _draw_mazes(config: PlotConfig, env_name: str, results: Mapping[str, Results
 
     chosen = {name: array[which] for name, array in tasks.items()}
     key = jax.random.key(seed)
-    drawn = set()
+    drawn: set[str] = set()
     for number, result in enumerate(results.values()):
         path = result.config.get("policy")
         env, policy = load_policy(env_name, path and Path(path))
@@ -510,13 +545,13 @@ def _draw_mazes(config: PlotConfig, env_name: str, results: Mapping[str, Results
         walk = positions_of(episode, len(maze))[0]
         gif = out / f"{name}_episode_task{task}.gif"
         maze_gif(gif, maze, start_of(maze), tasks["goal"][task], walk, goals_of(prompt))
-        print(gif)
+        print(gif, file=sys.stderr)
 
 
 def _save(figure: Figure, path: Path) -> None:
     with mpl.rc_context(STYLE):
         figure.savefig(path)
-    print(path)
+    print(path, file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -81,9 +81,6 @@ def test_heads_turn_their_parameters_into_a_distribution(name, num_params):
     action = distribution.mode()
     assert action.shape == (() if name == "categorical" else (3,))
     assert np.isfinite(distribution.log_prob(action))
-    # Parameters with leading axes give a batch of distributions.
-    batch = head.make(jnp.stack([params, 2 * params]))
-    assert batch.mode().shape == (2, *action.shape)
 
 
 def test_gaussian_head_bounds_mean_and_spread():

@@ -1,0 +1,316 @@
+"""Datasets: files and their corruptions, gathering, slices and the stream of batches."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from itertools import islice
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from envs.base import EnvSpec
+from mgpo_jax.dataset import (
+    ARRAYS,
+    MANIFEST,
+    Dataset,
+    check_dataset,
+    hash_file,
+    hash_task,
+    load_dataset,
+    plan_batches,
+    save_dataset,
+)
+from mgpo_jax.errors import DataError
+from mgpo_jax.types import Trajectory
+
+SPEC = EnvSpec(
+    name="toy",
+    obs_dim=2,
+    goal_dim=3,
+    action_dim=4,
+    discrete=True,
+    horizon=9,
+    return_range=(0.0, 1.0),
+    truncate_in_hindsight=True,
+)
+LENGTHS = [3, 1, 9, 4]
+
+
+def make_dataset(lengths=LENGTHS):
+    """``obs[:, 0]`` is the trajectory's index, ``obs[:, 1]`` counts its steps from 1."""
+    rng = np.random.default_rng(0)
+    lengths = np.array(lengths, np.int32)
+    total = int(lengths.sum())
+    index = np.repeat(np.arange(len(lengths)), lengths)
+    step = np.concatenate([1 + np.arange(length) for length in lengths])
+    return Dataset(
+        obs=np.stack([index, step], axis=1).astype(np.float32),
+        actions=rng.integers(SPEC.action_dim, size=total).astype(np.int32),
+        goals=rng.normal(size=(total, SPEC.goal_dim)).astype(np.float32),
+        goal_reached=rng.random(total) < 0.5,
+        outcomes=rng.normal(size=(total, SPEC.goal_dim)).astype(np.float32),
+        lengths=lengths,
+        task_hashes=np.arange(len(lengths), dtype=np.uint64) + 100,
+    )
+
+
+@pytest.fixture
+def dataset():
+    return make_dataset()
+
+
+@pytest.fixture
+def folder(tmp_path, dataset):
+    save_dataset(tmp_path / "data", dataset, {"env": "toy"})
+    return tmp_path / "data"
+
+
+def assert_equal(a, b):
+    for name, array in vars(a).items():
+        np.testing.assert_array_equal(array, vars(b)[name])
+        assert array.dtype == vars(b)[name].dtype
+
+
+def test_save_and_load(folder, dataset):
+    loaded, manifest = load_dataset(folder, SPEC)
+    assert_equal(loaded, dataset)
+    assert manifest["env"] == "toy"
+    assert manifest["num_trajectories"] == 4
+    assert manifest["num_steps"] == 17
+    assert sorted(path.name for path in folder.iterdir()) == [MANIFEST, ARRAYS]
+    assert [path.name for path in folder.parent.iterdir()] == [folder.name]
+
+
+def test_an_existing_folder_is_kept(folder, dataset):
+    before = hash_file(folder / ARRAYS)
+    with pytest.raises(DataError, match="exists already; remove it or .* --out"):
+        save_dataset(folder, make_dataset([1]), {})
+    assert hash_file(folder / ARRAYS) == before
+
+
+def test_gather_cuts_and_pads_with_zeros(dataset):
+    part = dataset.gather(np.array([2, 0, 2]), np.array([5, 3, 1]), 6)
+    np.testing.assert_array_equal(part.length, [5, 3, 1])
+    for row, (index, length) in enumerate([(2, 5), (0, 3), (2, 1)]):
+        start = [0, 3, 4, 13][index]
+        for name in Trajectory._fields[:-1]:
+            found, source = getattr(part, name)[row], getattr(dataset, name)
+            assert found.dtype == source.dtype
+            np.testing.assert_array_equal(found[:length], source[start : start + length])
+            assert not found[length:].any()
+
+
+def test_gather_of_a_continuous_dataset(dataset):
+    actions = np.random.default_rng(1).normal(size=(17, 2)).astype(np.float32)
+    part = replace(dataset, actions=actions).gather(np.array([3]), np.array([2]), 4)
+    np.testing.assert_array_equal(part.actions[0, :2], actions[13:15])
+    assert not part.actions[0, 2:].any()
+
+
+def test_slice(dataset):
+    part = dataset.slice(1, 3)
+    assert len(part) == 2
+    np.testing.assert_array_equal(part.lengths, [1, 9])
+    np.testing.assert_array_equal(part.task_hashes, [101, 102])
+    np.testing.assert_array_equal(part.obs[:, 0], [1] + [2] * 9)
+    assert_equal(dataset.slice(0, 4), dataset)
+    gathered = part.gather(np.array([1]), np.array([9]), 9)
+    np.testing.assert_array_equal(gathered.obs[0, :, 1], np.arange(1, 10))
+
+
+def test_hash_task_depends_on_every_entry():
+    fingerprint = np.arange(5)
+    hashes = {int(hash_task(fingerprint + shift)) for shift in np.eye(5, dtype=int)}
+    assert len(hashes | {int(hash_task(fingerprint))}) == 6
+    assert hash_task(fingerprint.astype(np.int8)) == hash_task(fingerprint)
+
+
+def plans(dataset, **changes):
+    options = {"seed": 1, "batch_size": 6, "part_size": 3, "bucket": 4, "truncate": True}
+    return plan_batches(dataset, **{**options, "pool_steps": 3, **changes})
+
+
+@settings(max_examples=25, deadline=None)
+@given(first=st.integers(0, 10), truncate=st.booleans(), seed=st.integers(0, 1000))
+def test_the_stream_can_start_anywhere(first, truncate, seed):
+    dataset = make_dataset()
+    whole = list(islice(plans(dataset, truncate=truncate, seed=seed), first + 4))[first:]
+    later = islice(plans(dataset, truncate=truncate, seed=seed, first_step=first), 4)
+    for batch, other in zip(whole, later, strict=True):
+        for part, other_part in zip(batch, other, strict=True):
+            np.testing.assert_array_equal(part.indices, other_part.indices)
+            np.testing.assert_array_equal(part.lengths, other_part.lengths)
+            assert part.num_steps == other_part.num_steps
+
+
+@pytest.mark.parametrize("truncate", [True, False])
+def test_batches_have_their_size_and_fit_their_padding(dataset, truncate):
+    for batch in islice(plans(dataset, truncate=truncate), 20):
+        assert len(batch) == 2
+        for part in batch:
+            assert part.indices.shape == part.lengths.shape == (3,)
+            assert part.lengths.min() >= 1
+            assert (part.lengths <= dataset.lengths[part.indices]).all()
+            assert truncate or (part.lengths == dataset.lengths[part.indices]).all()
+            assert part.lengths.max() <= part.num_steps <= 9
+            assert part.num_steps % 4 == 0 or part.num_steps == 9
+            assert part.num_steps - part.lengths.max() < 4
+
+
+def test_parts_hold_trajectories_of_nearly_equal_length():
+    dataset = make_dataset([1, 2, 3, 4, 5, 6, 7, 8])
+    batches = islice(plans(dataset, truncate=False, batch_size=40, part_size=10), 3)
+    spreads = [np.ptp(part.lengths) for batch in batches for part in batch]
+    assert max(spreads) <= 2
+
+
+def test_seeds_differ(dataset):
+    first, second = next(plans(dataset, seed=1)), next(plans(dataset, seed=2))
+    assert any((a.indices != b.indices).any() for a, b in zip(first, second, strict=True))
+
+
+def test_trajectories_and_cuts_are_uniform():
+    dataset = make_dataset([7, 7, 7])
+    batches = islice(plans(dataset, batch_size=60), 60)
+    parts = [part for batch in batches for part in batch]
+    indices = np.concatenate([part.indices for part in parts])
+    lengths = np.concatenate([part.lengths for part in parts])
+    cells = np.bincount(indices * 7 + lengths - 1, minlength=21)
+    assert len(cells) == 21
+    assert stats.chisquare(cells).pvalue > 1e-3
+
+
+def test_part_size_must_divide_the_batch(dataset):
+    with pytest.raises(ValueError, match="6 is not a multiple of part_size 4"):
+        next(plans(dataset, part_size=4))
+
+
+def rewrite(folder, change):
+    """Change the arrays and give the manifest the new hash."""
+    arrays = dict(np.load(folder / ARRAYS))
+    change(arrays)
+    np.savez_compressed(folder / ARRAYS, **arrays)
+    sign(folder)
+
+
+def sign(folder, **changes):
+    manifest = json.loads((folder / MANIFEST).read_text())
+    manifest.update(sha256=hash_file(folder / ARRAYS), **changes)
+    (folder / MANIFEST).write_text(json.dumps(manifest))
+
+
+def flip_byte(folder):
+    content = bytearray((folder / ARRAYS).read_bytes())
+    content[len(content) // 2] ^= 1
+    (folder / ARRAYS).write_bytes(content)
+
+
+def truncate_file(folder):
+    content = (folder / ARRAYS).read_bytes()
+    (folder / ARRAYS).write_bytes(content[: len(content) // 2])
+
+
+def truncate_and_sign(folder):
+    truncate_file(folder)
+    sign(folder)
+
+
+FILE_DAMAGE = {
+    "changed byte": (flip_byte, "differs from the hash.*collect it again"),
+    "truncated": (truncate_file, "differs from the hash.*collect it again"),
+    "truncated and signed": (truncate_and_sign, "does not hold the arrays.*collect it again"),
+    "no arrays": (lambda f: (f / ARRAYS).unlink(), "is missing.*collect it again"),
+    "no manifest": (lambda f: (f / MANIFEST).unlink(), "no dataset in .*manifest.json is missing"),
+    "manifest is no JSON": (
+        lambda f: (f / MANIFEST).write_text("{"),
+        "not readable JSON.*collect it again",
+    ),
+    "manifest is binary": (
+        lambda f: (f / MANIFEST).write_bytes(b"\xff\xfe\x80"),
+        "not readable JSON.*collect it again",
+    ),
+    "other format": (lambda f: sign(f, format=99), "has format 99, this version reads 1"),
+}
+
+
+@pytest.mark.parametrize("damage", FILE_DAMAGE)
+def test_damaged_files(folder, damage):
+    act, message = FILE_DAMAGE[damage]
+    act(folder)
+    with pytest.raises(DataError, match=message):
+        load_dataset(folder, SPEC)
+
+
+def test_no_folder(tmp_path):
+    with pytest.raises(DataError, match="no dataset in"):
+        load_dataset(tmp_path / "nowhere")
+
+
+ARRAY_DAMAGE = {
+    "missing array": (lambda a: a.pop("goals"), "does not hold the arrays.*collect it again"),
+    "unknown array": (lambda a: a.update(x=a["obs"]), "does not hold the arrays"),
+    "NaN": (lambda a: a["obs"].__setitem__((5, 1), np.nan), "obs holds NaN .*first at step 5"),
+    "infinity": (
+        lambda a: a["goals"].__setitem__((2, 0), np.inf),
+        "goals holds NaN or infinity, first at step 2",
+    ),
+    "too few steps": (
+        lambda a: a.update(actions=a["actions"][:-1]),
+        "actions has 16 steps, the lengths add up to 17",
+    ),
+    "empty trajectory": (
+        lambda a: a["lengths"].__setitem__(slice(2), [4, 0]),
+        "every trajectory needs at least one step",
+    ),
+    "no trajectories": (
+        lambda a: a.update({name: array[:0] for name, array in a.items()}),
+        "every trajectory needs at least one step",
+    ),
+    "obs of another world": (
+        lambda a: a.update(obs=a["obs"][:, :1]),
+        r"obs is float32\[1\] a step, toy needs floating\[2\]",
+    ),
+    "goals of another world": (
+        lambda a: a.update(goals=a["goals"][:, :2]),
+        r"goals is float32\[2\] a step, toy needs floating\[3\]",
+    ),
+    "continuous actions": (
+        lambda a: a.update(actions=a["actions"].astype(np.float32)),
+        r"actions is float32\[\] a step, toy needs integer\[\]",
+    ),
+    "goal_reached as numbers": (
+        lambda a: a.update(goal_reached=a["goal_reached"].astype(np.int32)),
+        "goal_reached is int32",
+    ),
+    "action too large": (
+        lambda a: a["actions"].__setitem__(3, 4),
+        r"actions must lie in 0\.\.3",
+    ),
+    "negative action": (lambda a: a["actions"].__setitem__(3, -1), "actions must lie in"),
+    "too long": (
+        lambda a: a.update(lengths=np.array([3, 14], np.int32)),
+        "a trajectory has 14 steps, the horizon of toy is 9",
+    ),
+}
+
+
+@pytest.mark.parametrize("damage", ARRAY_DAMAGE)
+def test_damaged_arrays(folder, damage):
+    change, message = ARRAY_DAMAGE[damage]
+    rewrite(folder, change)
+    with pytest.raises(DataError, match=message):
+        load_dataset(folder, SPEC)
+
+
+def test_pickled_arrays_are_never_loaded(folder):
+    rewrite(folder, lambda arrays: arrays.update(actions=np.array([{}] * 17, object)))
+    with pytest.raises(DataError, match="does not hold the arrays"):
+        load_dataset(folder)
+
+
+def test_check_without_a_world_accepts_any_sizes(dataset):
+    check_dataset(replace(dataset, obs=dataset.obs[:, :1]), "here")

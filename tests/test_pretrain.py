@@ -1,0 +1,229 @@
+"""Pre-training: the loss by hand, gradients however a batch is divided, exact resume, schedules."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import islice
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import special
+
+from mgpo_jax.dataset import BatchPlan, Dataset
+from mgpo_jax.pretrain import (
+    TrainConfig,
+    TrainState,
+    batch_stream,
+    bc_loss,
+    learning_rate_schedule,
+    make_trainer,
+)
+from mgpo_jax.prompts import hindsight_outcome, sample_prompt
+from mgpo_jax.sharding import device_mesh
+from mgpo_jax.transformer import GoalTransformer, TransformerConfig
+
+HORIZON = 6
+NETWORK = TransformerConfig(
+    obs_dim=3, goal_dim=2, action_dim=3, horizon=HORIZON, max_prompt_length=3,
+    embed_dim=16, num_layers=2, dropout=0.0,
+)  # fmt: skip
+# Buckets as long as the horizon: one shape, one compilation.
+CONFIG = TrainConfig(
+    steps=40, batch_size=8, part_size=4, bucket=HORIZON, learning_rate=1e-2, warmup_steps=2,
+    clip_norm=1e9,
+)  # fmt: skip
+
+
+def make_dataset():
+    """The action is the entry of the observation that is set: easy to learn."""
+    rng = np.random.default_rng(0)
+    lengths = np.array([6, 2, 5, 1, 4, 6, 3, 6], np.int32)
+    total = int(lengths.sum())
+    actions = rng.integers(3, size=total).astype(np.int32)
+    goals = rng.random((total, 2)).astype(np.float32)
+    return Dataset(
+        obs=np.eye(3, dtype=np.float32)[actions],
+        actions=actions,
+        goals=goals,
+        goal_reached=np.ones(total, bool),
+        outcomes=goals,
+        lengths=lengths,
+        task_hashes=np.zeros(len(lengths), np.uint64),
+    )
+
+
+DATASET = make_dataset()
+WHOLE = BatchPlan(np.arange(8), DATASET.lengths, HORIZON)
+
+
+def parts_of(size):
+    return [
+        BatchPlan(WHOLE.indices[i : i + size], WHOLE.lengths[i : i + size], HORIZON)
+        for i in range(0, 8, size)
+    ]
+
+
+@pytest.fixture(scope="module")
+def noisy_trainer():
+    """Dropout, random prompts, two devices."""
+    return make_trainer(CONFIG, replace(NETWORK, dropout=0.1), DATASET, device_mesh(2))
+
+
+def run(trainer, state, num_steps):
+    metrics = []
+    for plans in islice(batch_stream(CONFIG, DATASET, True, state.step), num_steps):
+        state, metric = trainer.step(state, plans)
+        metrics.append(jax.tree.map(float, metric))
+    return state, metrics
+
+
+def to_host(state):
+    """What a checkpoint keeps; the step donates its buffers, so copies are needed."""
+    return jax.tree.map(np.array, state)
+
+
+def test_the_loss_falls_and_a_resumed_run_equals_an_uninterrupted_one(noisy_trainer):
+    state, metrics = run(noisy_trainer, noisy_trainer.init(), 12)
+    middle = to_host(state)
+    state, more = run(noisy_trainer, state, 28)
+    losses = [metric["loss"] for metric in metrics + more]
+    assert state.step == 40
+    assert losses[0] == pytest.approx(np.log(3), abs=0.2)
+    assert np.mean(losses[-5:]) < 0.5 * losses[0]
+    assert noisy_trainer.evaluate(state.params, [WHOLE])["accuracy"] > 0.9
+
+    restored = jax.tree.map(jnp.asarray, (middle.params, middle.opt_state))
+    resumed, again = run(noisy_trainer, TrainState(*restored, 12), 28)
+    assert again == more
+    jax.tree.map(np.testing.assert_array_equal, to_host(resumed), to_host(state))
+
+
+def gradient(network, part_size, num_devices):
+    """The gradient of the whole data set: AdamW's first moment is a tenth of the first one."""
+    config = replace(CONFIG, part_size=part_size)
+    trainer = make_trainer(config, network, DATASET, device_mesh(num_devices))
+    state = trainer.init()
+    params = to_host(state.params)
+    state, metrics = trainer.step(state, parts_of(part_size))
+    moments = state.opt_state[1][0].mu
+    return params, jax.tree.map(lambda mu: 10 * np.asarray(mu), moments), metrics
+
+
+@pytest.fixture(scope="module")
+def one_goal():
+    """Prompts of one goal: the only ones that do not depend on how a batch is divided."""
+    network = replace(NETWORK, max_prompt_length=1)
+    return network, gradient(network, 8, 1)
+
+
+def test_the_gradient_is_that_of_the_mean_loss(one_goal):
+    network, (params, found, metrics) = one_goal
+    batch = DATASET.gather(*WHOLE)
+
+    def mean_loss(params):
+        one = lambda trajectory: bc_loss(  # noqa: E731
+            params, jax.random.key(0), GoalTransformer(network), trajectory, True
+        )[0]
+        return jnp.sum(jax.vmap(one)(batch)) / DATASET.lengths.sum()
+
+    loss, grads = jax.jit(jax.value_and_grad(mean_loss))(params)
+    assert_close(found, grads)
+    np.testing.assert_allclose(metrics["loss"], loss, rtol=1e-5)
+    assert metrics["num_steps"] == DATASET.lengths.sum()
+    norm = np.sqrt(sum(np.sum(leaf**2) for leaf in jax.tree.leaves(grads)))
+    np.testing.assert_allclose(metrics["grad_norm"], norm, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("part_size", "num_devices"), [(4, 1), (2, 2)])
+def test_the_gradient_does_not_depend_on_parts(one_goal, part_size, num_devices):
+    network, (_, expected, metrics) = one_goal
+    _, found, found_metrics = gradient(network, part_size, num_devices)
+    assert_close(found, expected)
+    assert_close(found_metrics, metrics)
+
+
+def test_the_gradient_does_not_depend_on_devices():
+    """The same random prompts, whatever device draws them."""
+    _, expected, metrics = gradient(NETWORK, 4, 1)
+    _, found, found_metrics = gradient(NETWORK, 4, 2)
+    assert_close(found, expected)
+    assert_close(found_metrics, metrics)
+
+
+def assert_close(found, expected):
+    check = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)  # noqa: E731
+    jax.tree.map(check, found, expected)
+
+
+@pytest.fixture(scope="module")
+def loss_of():
+    network = GoalTransformer(NETWORK)
+    return jax.jit(lambda params, key, one: bc_loss(params, key, network, one, True))
+
+
+@pytest.fixture(scope="module")
+def params():
+    rng = np.random.default_rng(0)
+    trainer = make_trainer(CONFIG, NETWORK, DATASET, device_mesh(1))
+    shapes = jax.eval_shape(trainer.init).params
+    return jax.tree.map(
+        lambda leaf: jnp.asarray(0.3 * rng.standard_normal(leaf.shape), leaf.dtype), shapes
+    )
+
+
+def test_bc_loss_by_hand(loss_of, params):
+    length = 4
+    one = DATASET.gather(np.array([0]), np.array([length]), HORIZON)
+    one = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), one)
+    key = jax.random.key(5)
+    nll, sums = loss_of(params, key, one)
+
+    key_prompt, _ = jax.random.split(key)
+    prompt = sample_prompt(key_prompt, one, hindsight_outcome(one), 3)
+    logits = jax.jit(GoalTransformer(NETWORK).apply)(params, prompt, one.obs, one.actions).logits
+    log_prob = special.log_softmax(np.asarray(logits, np.float64), axis=-1)
+    actions = np.asarray(one.actions)
+    expected = -sum(log_prob[t, actions[t]] for t in range(length))
+    np.testing.assert_allclose(nll, expected, rtol=1e-5)
+    np.testing.assert_allclose(sums.nll, expected, rtol=1e-5)
+    assert sums.correct == (np.argmax(logits, axis=-1) == actions)[:length].sum()
+    assert sums.num_steps == length
+
+
+def test_bc_loss_ignores_padding(loss_of, params):
+    one = DATASET.gather(np.array([0]), np.array([4]), HORIZON)
+    one = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), one)
+    junk = one._replace(
+        obs=one.obs.at[4:].set(7.0),
+        actions=one.actions.at[4:].set(2),
+        goals=one.goals.at[4:].set(-5.0),
+        goal_reached=jnp.ones(HORIZON, bool),
+        outcomes=one.outcomes.at[4:].set(9.0),
+    )
+    for seed in range(5):
+        key = jax.random.key(seed)
+        jax.tree.map(
+            np.testing.assert_array_equal, loss_of(params, key, one), loss_of(params, key, junk)
+        )
+
+
+@pytest.mark.parametrize("schedule", ["cosine", "constant"])
+def test_schedules(schedule):
+    config = TrainConfig(steps=1000, warmup_steps=100, learning_rate=0.5, schedule=schedule)
+    rate = learning_rate_schedule(config)
+    at = [float(rate(step)) for step in (0, 50, 100, 550, 1000, 2000)]
+    # Half way down the cosine lies the middle of 100 % and 2 %.
+    after = [0.51 * 0.5, 0.01, 0.01] if schedule == "cosine" else [0.5, 0.5, 0.5]
+    np.testing.assert_allclose(at, [0.0, 0.25, 0.5, *after], atol=1e-6)
+
+
+def test_a_run_shorter_than_its_warm_up_still_reaches_the_peak():
+    rate = learning_rate_schedule(TrainConfig(steps=10, warmup_steps=300, schedule="constant"))
+    assert float(rate(10)) == pytest.approx(1e-3)
+
+
+def test_devices_must_divide_the_parts():
+    with pytest.raises(ValueError, match="part_size 3 does not divide over 2 devices"):
+        make_trainer(replace(CONFIG, part_size=3), NETWORK, DATASET, device_mesh(2))
