@@ -106,7 +106,7 @@ def bench_gradient_step(env: Environment, dataset: Dataset, num_steps: int) -> I
     network = network_config(env.spec, dropout=config.dropout)
     mesh = device_mesh(largest_divisor(config.train.part_size, len(jax.devices())))
     trainer = make_trainer(config.train, network, dataset, mesh)
-    stream = batch_stream(config.train, dataset, env.spec.truncate_in_hindsight)
+    stream = batch_stream(config.train, dataset, env.spec.truncate_in_hindsight, mesh.devices.size)
     batches = list(islice(stream, num_steps))
 
     def steps(state: Any) -> Any:

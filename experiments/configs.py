@@ -111,7 +111,7 @@ PRESETS = ("fast", "paper", "smoke")
 PAPER_STEPS = {"maze15": 50_000, "maze30": 200_000}
 FAST = {
     "maze15": TrainConfig(steps=20_000),
-    "maze30": TrainConfig(steps=20_000, part_size=4, bucket=32),
+    "maze30": TrainConfig(steps=20_000, bucket=32),
 }
 
 

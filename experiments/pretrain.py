@@ -169,7 +169,7 @@ def open_run(config: PretrainConfig) -> Path:
 def main(config: PretrainConfig) -> None:
     """Pre-train the multi-goal Transformer on hindsight prompts."""
     positive(config.data, "episodes")
-    positive(config.train, "steps", "batch_size", "part_size", "bucket")
+    positive(config.train, "steps", "batch_size", "part_size", "part_steps", "bucket")
     positive(config, "max_prompt_length", "eval_tasks", "eval_every", "save_every", "holdout")
     if config.train.batch_size % config.train.part_size:
         raise UsageError(
@@ -194,7 +194,7 @@ def main(config: PretrainConfig) -> None:
     validate = make_trainer(train, network, held_out, mesh).evaluate
     evaluate_greedily = greedy_evaluation(env, network, config.eval_tasks)
     # Two batches of one padded length: the validation loss is of the same draws every time.
-    part = replace(train, batch_size=512, part_size=64, bucket=env.spec.horizon)
+    part = replace(train, batch_size=512, part_size=64, part_steps=1 << 30, bucket=env.spec.horizon)
     truncate = env.spec.truncate_in_hindsight
     held_out_parts = next(batch_stream(part, held_out, truncate))
 
@@ -204,7 +204,7 @@ def main(config: PretrainConfig) -> None:
             state = restore_state(manager, state) or state
             print(f"resuming {folder} at step {state.step}", file=sys.stderr)
         metrics = Metrics(folder, config, state.step)
-        batches = batch_stream(train, fit, truncate, first_step=state.step)
+        batches = batch_stream(train, fit, truncate, mesh.devices.size, first_step=state.step)
         progress = tqdm(total=train.steps, initial=state.step, unit="step", disable=None)
         pending: list[dict[str, jax.Array]] = []
         clock = time.process_time()
@@ -236,7 +236,7 @@ def main(config: PretrainConfig) -> None:
 
     made = {"env": config.env, "config": to_json(config), "steps": state.step}
     save_policy(folder / "policy", network, state.params, made)
-    from experiments.plot import training_curve
+    from experiments.figures import training_curve
 
     training_curve(folder / "metrics.jsonl").savefig(folder / "training.png")
     print(f"policy written to {folder / 'policy'}", file=sys.stderr)

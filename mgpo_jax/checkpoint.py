@@ -76,7 +76,8 @@ def restore_state(manager: ocp.CheckpointManager, blank: TrainState) -> TrainSta
     # The optimizer's tuples come back as the blank state's own types.
     tree = jax.tree.structure((blank.params, blank.opt_state))
     leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves((params, opt_state))]
-    return TrainState(*jax.tree.unflatten(tree, leaves), step)
+    params, opt_state = jax.tree.unflatten(tree, leaves)
+    return TrainState(params, opt_state, step)
 
 
 def network_config(spec: EnvSpec, **sizes: Any) -> TransformerConfig:

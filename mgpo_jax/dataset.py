@@ -190,15 +190,20 @@ def plan_batches(
     part_size: int,
     bucket: int,
     truncate: bool,
+    part_steps: int | None = None,
+    min_part: int = 1,
     first_step: int = 0,
     pool_steps: int = 16,
 ) -> Iterator[list[BatchPlan]]:
-    """Batches of ``batch_size`` trajectories, in parts of ``part_size`` of nearly equal length.
+    """Batches of ``batch_size`` trajectories, in parts of nearly equal length.
 
     Trajectories are drawn uniformly with replacement and, with ``truncate``, cut at a uniformly
     random step (appendix D). The draws of ``pool_steps`` batches are sorted by length, cut into
-    parts and the parts shuffled, so that little padding is computed and yet every batch is a mix of
-    all lengths. Part lengths are rounded up to multiples of ``bucket`` to bound the number of shapes.
+    parts of ``part_size`` and the parts shuffled, so that little padding is computed and yet every
+    batch is a mix of all lengths. Part lengths are rounded up to multiples of ``bucket`` to bound
+    the number of shapes; parts with more than ``part_steps`` padded steps are halved until they fit,
+    so that short and long trajectories fill the same amount of cache (but not below multiples of
+    ``min_part``, the number of devices).
 
     The stream is a function of the seed alone: starting at ``first_step`` skips exactly the batches
     before it.
@@ -215,10 +220,15 @@ def plan_batches(
         if truncate:
             lengths = rng.integers(1, lengths + 1)
         order = np.argsort(lengths, kind="stable").reshape(-1, part_size)
-        parts = []
-        for rows in order[rng.permutation(len(order))]:
-            num_steps = min(-(-int(lengths[rows].max()) // bucket) * bucket, longest)
-            parts.append(BatchPlan(indices[rows], lengths[rows], num_steps))
+        order = order[rng.permutation(len(order))]
         for step in range(offset, pool_steps):
-            yield parts[step * parts_per_batch : (step + 1) * parts_per_batch]
+            batch = []
+            for rows in order[step * parts_per_batch : (step + 1) * parts_per_batch]:
+                num_steps = min(-(-int(lengths[rows].max()) // bucket) * bucket, longest)
+                size = part_size
+                while part_steps and size * num_steps > part_steps and size % (2 * min_part) == 0:
+                    size //= 2
+                for piece in rows.reshape(-1, size):
+                    batch.append(BatchPlan(indices[piece], lengths[piece], num_steps))
+            yield batch
         pool_index, offset = pool_index + 1, 0

@@ -19,7 +19,7 @@ import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Key
 
 from mgpo_jax.dataset import BatchPlan, Dataset, plan_batches
 from mgpo_jax.prompts import hindsight_outcome, sample_prompt, single_goal
@@ -48,6 +48,8 @@ class TrainConfig:
     """Largest global norm of the gradient [0.25*]."""
     part_size: int = 16
     """Trajectories computed at once, over all devices; changes speed and memory, not the sum."""
+    part_steps: int = 1024
+    """Parts with more padded steps than this are halved; about what fits into a core's cache."""
     bucket: int = 4
     """Padded lengths are multiples of this many steps."""
     seed: int = 0
@@ -71,10 +73,10 @@ class Stats(NamedTuple):
 
 
 def learning_rate_schedule(config: TrainConfig) -> optax.Schedule:
-    rate, warmup = config.learning_rate, min(config.warmup_steps, config.steps)
+    rate, warmup = config.learning_rate, min(config.warmup_steps, config.steps - 1)
     if config.schedule == "cosine":
         return optax.warmup_cosine_decay_schedule(0.0, rate, warmup, config.steps, 0.02 * rate)
-    return optax.linear_schedule(0.0, rate, warmup)
+    return optax.linear_schedule(0.0, rate, warmup) if warmup else optax.constant_schedule(rate)
 
 
 def make_optimizer(config: TrainConfig) -> optax.GradientTransformation:
@@ -147,30 +149,34 @@ def make_trainer(
     flatten = jax.jit(lambda params: ravel_pytree(params)[0])
 
     def batch_loss(
-        params: Any, keys: PRNGKeyArray, part: Trajectory, deterministic: bool
+        params: Any, keys: Key[Array, "B"], part: Trajectory, deterministic: bool
     ) -> tuple[Array, Stats]:
         loss = partial(bc_loss, params, network=network, deterministic=deterministic)
         nll, stats = jax.vmap(lambda key, one: loss(key, trajectory=one))(keys, part)
         return nll.sum(), jax.tree.map(jnp.sum, stats)
 
-    @partial(jax.jit, donate_argnums=1)
-    def accumulate(weights: Array, sums: Any, key: PRNGKeyArray, part: Trajectory) -> Any:
+    spread, copied = PartitionSpec(AXIS), PartitionSpec()
+
+    def on_devices(in_specs: Any, out_specs: Any, **options: Any) -> Callable[[Callable], Any]:
+        """A jitted function that runs on every device by itself, without collectives."""
+
+        def wrap(function: Callable) -> Any:
+            mapped = jax.shard_map(
+                function, mesh=mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False
+            )
+            return jax.jit(mapped, **options)
+
+        return wrap
+
+    # Weights and gradients travel between devices as one vector, and are computed with as trees.
+    unpack = on_devices(copied, copied)(unravel)
+    pack = on_devices(spread, spread)(lambda sums: (ravel_pytree(sums[0])[0][None], sums[1]))
+
+    @on_devices((copied, spread, spread, spread), spread, donate_argnums=1)
+    def accumulate(params: Any, sums: Any, keys: Key[Array, "B"], part: Trajectory) -> Any:
         """Add one part's gradient and stats to ``sums``, a row of which belongs to each device."""
-
-        def on_device(weights: Array, sums: Any, keys: PRNGKeyArray, part: Trajectory) -> Any:
-            grads, stats = jax.grad(batch_loss, has_aux=True)(unravel(weights), keys, part, False)
-            added = (ravel_pytree(grads)[0], stats)
-            return jax.tree.map(lambda row, new: row + new, sums, added)
-
-        spread = PartitionSpec(AXIS)
-        keys = jax.random.split(key, part.length.shape[0])
-        return jax.shard_map(
-            on_device,
-            mesh=mesh,
-            in_specs=(PartitionSpec(), spread, spread, spread),
-            out_specs=spread,
-            check_vma=False,  # gradients stay on their device until the update sums them
-        )(weights, sums, keys, part)
+        added = jax.grad(batch_loss, has_aux=True)(params, keys, part, False)
+        return jax.tree.map(lambda row, new: row + new, sums, added)
 
     @partial(jax.jit, donate_argnums=(0, 1))
     def update(params: Any, opt_state: Any, rows: list[Any]) -> tuple[Any, Any, dict[str, Array]]:
@@ -185,26 +191,31 @@ def make_trainer(
         }
         return optax.apply_updates(params, updates), opt_state, metrics
 
-    @partial(jax.jit, static_argnums=0, out_shardings=NamedSharding(mesh, PartitionSpec(AXIS)))
-    def zeros(num_weights: int) -> Any:
-        return jnp.zeros((num_devices, num_weights)), Stats(*jnp.zeros((3, num_devices)))
+    @partial(jax.jit, out_shardings=NamedSharding(mesh, spread))
+    def zeros() -> Any:
+        grads = jax.tree.map(lambda leaf: jnp.zeros((num_devices, *leaf.shape)), shapes)
+        return grads, Stats(*jnp.zeros((3, num_devices)))
+
+    @partial(jax.jit, static_argnums=2, out_shardings=NamedSharding(mesh, spread))
+    def part_keys(step: Any, index: Any, num: int) -> Key[Array, "B"]:
+        key = jax.random.fold_in(jax.random.fold_in(key_steps, step), index)
+        return jax.random.split(key, num)
 
     @jax.jit
     def part_stats(params: Any, key: PRNGKeyArray, part: Trajectory) -> Stats:
         return batch_loss(params, jax.random.split(key, part.length.shape[0]), part, True)[1]
 
     def step(state: TrainState, plans: list[BatchPlan]) -> tuple[TrainState, dict[str, Array]]:
-        weights = flatten(state.params)
-        sums = zeros(weights.size)
-        weights = replicate(mesh, weights)
-        key = jax.random.fold_in(key_steps, state.step)
+        params, sums = unpack(replicate(mesh, flatten(state.params))), zeros()
         for index, plan in enumerate(plans):
             part = split(mesh, dataset.gather(*plan))
-            sums = accumulate(weights, sums, jax.random.fold_in(key, index), part)
+            keys = part_keys(state.step, index, len(plan.lengths))
+            sums = accumulate(params, sums, keys, part)
         # Rows travel by plain copies: a collective can deadlock on a CPU's small thread pool.
+        packed = pack(sums)
         rows = [
             jax.tree.map(
-                lambda leaf, i=i: jax.device_put(leaf.addressable_shards[i].data, home), sums
+                lambda leaf, i=i: jax.device_put(leaf.addressable_shards[i].data, home), packed
             )
             for i in range(num_devices)
         ]
@@ -220,7 +231,7 @@ def make_trainer(
 
 
 def batch_stream(
-    config: TrainConfig, dataset: Dataset, truncate: bool, first_step: int = 0
+    config: TrainConfig, dataset: Dataset, truncate: bool, num_devices: int = 1, first_step: int = 0
 ) -> Iterator[list[BatchPlan]]:
     """The batches of a run from ``first_step`` on."""
     return plan_batches(
@@ -230,5 +241,7 @@ def batch_stream(
         part_size=config.part_size,
         bucket=config.bucket,
         truncate=truncate,
+        part_steps=config.part_steps,
+        min_part=num_devices,
         first_step=first_step,
     )

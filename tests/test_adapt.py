@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import mgpo_jax.rollout
 from envs.maze_runner import MazeRunner
 from mgpo_jax.adapt import adapt, continue_adaptation, evaluate, start_adaptation
 from mgpo_jax.optimizers import SearchSpace, ucb
@@ -22,6 +23,14 @@ CONFIG = TransformerConfig(
     obs_dim=6, goal_dim=2, action_dim=5, horizon=12, max_prompt_length=3,
     embed_dim=16, num_layers=1, dropout=0.0,
 )  # fmt: skip
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_segments():
+    """Every segment of an episode is compiled on its own; two are enough to cross a border."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mgpo_jax.rollout, "NUM_SEGMENTS", 2)
+        yield
 
 
 def make_env():
@@ -54,9 +63,7 @@ def params():
 
 
 def make_optimizer(env, policy):
-    return ucb(
-        SearchSpace(policy.num_slots, env.sample_goal, env.spec.return_range, NUM_EPISODES)
-    )
+    return ucb(SearchSpace(policy.num_slots, env.sample_goal, env.spec.return_range, NUM_EPISODES))
 
 
 @partial(jax.jit, static_argnames="env")
@@ -139,9 +146,7 @@ def test_tasks_and_seeds_are_lanes(params, tasks):
     lanes = run(*pairs)
     for index in range(num_lanes):
         single = adapt_one(params, pairs[0][index], make_env(), lane(pairs[1], index))
-        jax.tree.map(
-            partial(np.testing.assert_allclose, atol=1e-5), lane(lanes, index), single
-        )
+        jax.tree.map(partial(np.testing.assert_allclose, atol=1e-5), lane(lanes, index), single)
     assert len(np.unique(lanes.log.returns)) > 3  # the lanes do differ
 
 

@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from evosax.algorithms import CMA_ES
+from scipy import stats
 
 from mgpo_jax.optimizers import SearchSpace, bbt
 from mgpo_jax.optimizers.bbt import rank_weights
 from mgpo_jax.types import Episode, Trajectory
 
-DIM, POPULATION, NUM_RUNS = 5, 10, 15
+DIM, POPULATION, NUM_RUNS, NUM_PYCMA = 5, 10, 60, 20
 SCALES = {"sphere": np.ones(DIM), "ellipsoid": 10 ** np.linspace(0, 3, DIM)}
 TARGET = 1e-4
 
@@ -71,7 +72,7 @@ def test_rank_weights_search_like_pycma(strict, function):
     ours = np.median(reached.argmax(axis=1) + 1)
 
     theirs = []
-    for seed in range(1, NUM_RUNS + 1):
+    for seed in range(1, NUM_PYCMA + 1):
         strategy, generations, best = pycma(seed), 0, np.inf
         while best >= TARGET:
             population = strategy.ask()
@@ -85,17 +86,16 @@ def test_rank_weights_search_like_pycma(strict, function):
 def test_step_size_survives_ties(strict):
     """With all returns equal the step size does what pycma's does; evosax's own shaping loses it."""
     zeros = jnp.zeros((NUM_RUNS, DIM))
-    ours = float(np.median(strict(keys(2), zeros)[1][:, 9])) / 0.5
+    ours = np.asarray(strict(keys(2), zeros)[1][:, 9])
     theirs = []
     for seed in range(1, NUM_RUNS + 1):
         strategy = pycma(seed)
         for _ in range(10):
             strategy.tell(strategy.ask(), [0.0] * POPULATION)
-        theirs.append(strategy.sigma / 0.5)
+        theirs.append(strategy.sigma)
     default = jax.jit(jax.vmap(lambda key, scales: evolve(key, scales, 10)))(keys(2), zeros)
-    assert 0.7 < ours < 1.1
-    assert abs(ours - np.median(theirs)) < 0.15
-    assert float(np.median(default[1][:, 9])) / 0.5 < 0.6 * ours
+    assert stats.ks_2samp(ours, theirs).pvalue > 1e-3
+    assert float(np.median(default[1][:, 9])) < 0.6 * np.median(ours)
 
 
 def test_rank_weights_order_ties_and_put_nan_last():
@@ -131,7 +131,9 @@ def search(key):
         query, asked = optimizer.ask(key_ask, state)
         result = play(key_play, query)
         told = optimizer.tell(asked, query, result)
-        return told, (query, result, asked, told, optimizer.best(told))
+        # The states are logged, but for their key, which is no number.
+        states = (state._replace(start_key=jnp.int32(0)) for state in (asked, told))
+        return told, (query, result, *states, optimizer.best(told))
 
     state = optimizer.init(key_init, TASK_GOAL, BLANK)
     return jax.lax.scan(episode, state, jax.random.split(key_run, NUM_EPISODES))[1]
@@ -206,5 +208,5 @@ def test_the_best_prompt_is_the_first_of_the_highest_return(logs):
 
 
 def test_step_size_is_where_the_search_starts(logs):
-    *_, asked, _, _ = logs
+    _, _, asked, _, _ = logs
     np.testing.assert_allclose(asked.cma.std[:, 0], 0.1, rtol=1e-6)

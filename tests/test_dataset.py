@@ -87,7 +87,7 @@ def test_save_and_load(folder, dataset):
 
 def test_an_existing_folder_is_kept(folder, dataset):
     before = hash_file(folder / ARRAYS)
-    with pytest.raises(DataError, match="exists already; remove it or .* --out"):
+    with pytest.raises(DataError, match=r"exists already; remove it or .* --out"):
         save_dataset(folder, make_dataset([1]), {})
     assert hash_file(folder / ARRAYS) == before
 

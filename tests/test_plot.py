@@ -19,7 +19,8 @@ from matplotlib.patches import Circle, Rectangle
 
 from envs import render
 from envs.maze_runner import NORTH, MazeRunner
-from experiments import plot
+from experiments import figures, plot
+from experiments import results as results_module
 from mgpo_jax.distributions import Categorical
 from mgpo_jax.errors import DataError, UsageError
 from mgpo_jax.policy import Policy
@@ -54,7 +55,7 @@ def north_policy() -> Policy:
 NORTHWARD = north_policy()
 
 
-def fake_results(bandit: str = "ucb", shift: float = 0.0) -> plot.Results:
+def fake_results(bandit: str = "ucb", shift: float = 0.0) -> results_module.Results:
     """2 seeds, 2 tasks, 20 episodes, 3 slots; the best prompt gains a waypoint at episode 10."""
     shape = (2, 2, 20, 3)
     masks = np.zeros(shape, bool)
@@ -64,7 +65,7 @@ def fake_results(bandit: str = "ucb", shift: float = 0.0) -> plot.Results:
     goals[..., -1, :] = np.array(GOAL) / SIDE
     goals[:, :, 9:, -2, :] = np.array([3, 3]) / SIDE
     evals = np.array([[[-3.0, -1.0], [-1.0, 0.0]], [[-2.0, -1.0], [-2.0, 1.0]]]) + shift
-    return plot.Results(
+    return results_module.Results(
         returns=np.full(shape[:3], -1.0, np.float32),
         greedy=np.ones(shape[:3], bool),
         prompt_goals=goals,
@@ -80,9 +81,11 @@ def fake_results(bandit: str = "ucb", shift: float = 0.0) -> plot.Results:
     )
 
 
-def save_results(folder: Path, results: plot.Results) -> Path:
+def save_results(folder: Path, results: results_module.Results) -> Path:
     folder.mkdir(parents=True)
-    np.savez(folder / "results.npz", **{name: getattr(results, name) for name in plot.AXES})
+    np.savez(
+        folder / "results.npz", **{name: getattr(results, name) for name in results_module.AXES}
+    )
     np.savez(folder / "tasks.npz", **results.tasks)
     (folder / "config.json").write_text(json.dumps(results.config))
     (folder / "summary.json").write_text("{}")
@@ -210,7 +213,7 @@ def test_gif_shows_every_step(tmp_path):
 
 
 def test_learning_curve_is_mean_over_tasks_and_std_over_seeds():
-    figure = plot.learning_curve({"ucb": fake_results(), "bbt": fake_results("bbt", shift=-1)})
+    figure = figures.learning_curve({"ucb": fake_results(), "bbt": fake_results("bbt", shift=-1)})
     (ax,) = figure.axes
     lines = {line.get_label(): line for line in ax.lines}
     assert set(lines) == {"MGPO-UCB", "BBT", "optimum"}
@@ -231,26 +234,26 @@ def test_training_curve_shows_what_was_logged(tmp_path):
     ]
     path = tmp_path / "metrics.jsonl"
     path.write_text("".join(json.dumps(row) + "\n" for row in rows))
-    losses, returns = plot.training_curve(path).axes
+    losses, returns = figures.training_curve(path).axes
     curves = [line.get_xydata().tolist() for line in (*losses.lines, *returns.lines)]
     assert curves == [[[10, 1.5], [20, 1.0]], [[10, 1.6], [20, 1.2]], [[10, -6], [20, -4]]]
     path.write_text("{")
     with pytest.raises(DataError, match=r"metrics\.jsonl is missing or not readable"):
-        plot.training_curve(path)
+        figures.training_curve(path)
 
 
 def test_repeated_and_unknown_methods_get_colors_of_their_own():
     labels = ["ucb (a)", "ucb (b)", "bpe", "other"]
-    styles = plot.method_styles(labels)
-    assert styles["ucb (a)"][:2] == ("MGPO-UCB (a)", plot.METHODS["ucb"][1])
+    styles = figures.method_styles(labels)
+    assert styles["ucb (a)"][:2] == ("MGPO-UCB (a)", figures.METHODS["ucb"][1])
     assert len({style[1] for style in styles.values()}) == 4
-    assert len({style[1] for style in plot.METHODS.values()}) == len(plot.METHODS)
+    assert len({style[1] for style in figures.METHODS.values()}) == len(figures.METHODS)
 
 
 def test_final_prompts_of_all_methods_share_a_maze():
     results = {"ucb": fake_results(), "bbt": fake_results("bbt")}
     results["bbt"].best_goals[:, :, -1, -2] = [9.0, 9.0]
-    figure = plot.prompts_on_mazes(results, results["ucb"].tasks, which=(0, 1))
+    figure = figures.prompts_on_mazes(results, results["ucb"].tasks, which=(0, 1))
     assert len(figure.axes) == 2
     discs = discs_of(figure.axes[0])
     assert [disc[:3] for disc in discs[:1]] == [("1", 3, 3)]
@@ -261,16 +264,16 @@ def test_final_prompts_of_all_methods_share_a_maze():
 
 
 def test_visits_are_counted_per_episode(key):
-    task = plot.task_at(fake_results().tasks, 0)
+    task = figures.task_at(fake_results().tasks, 0)
     prompt = fake_results().best_prompt(0, 0)
-    counts = plot.visit_counts(plot.run_policy(key, ENV, NORTHWARD, task, prompt), MAZE)
+    counts = figures.visit_counts(figures.run_policy(key, ENV, NORTHWARD, task, prompt), MAZE)
     expected = np.zeros((SIDE, SIDE))
     expected[5:0:-1, 3] = [1, 1, 1, 1, 3]  # four steps up, the last two against the wall
     np.testing.assert_allclose(counts, expected)
 
 
 def test_evolution_shows_the_stages_there_are(key):
-    figure = plot.evolution(ENV, NORTHWARD, fake_results(), 0, stages=(1, 10, 40), key=key)
+    figure = figures.evolution(ENV, NORTHWARD, fake_results(), 0, stages=(1, 10, 40), key=key)
     mazes = [ax for ax in figure.axes if ax.images]
     # 6 steps at -0.1; episode 40 lies beyond the 20 of the results.
     assert [ax.get_title() for ax in mazes] == [
@@ -281,7 +284,7 @@ def test_evolution_shows_the_stages_there_are(key):
 
 
 def test_short_prompts_stand_above_long_ones(key):
-    figure = plot.short_and_long(ENV, NORTHWARD, fake_results().tasks, key)
+    figure = figures.short_and_long(ENV, NORTHWARD, fake_results().tasks, key)
     mazes = [ax for ax in figure.axes if ax.images]
     assert [ax.get_title().split("  ")[0] for ax in mazes] == ["1 goal"] * 2 + ["3 goals"] * 2
     for above, below in zip(mazes[:2], mazes[2:], strict=True):
@@ -293,7 +296,7 @@ def test_short_prompts_stand_above_long_ones(key):
 
 def test_results_survive_the_disk(tmp_path):
     results = fake_results()
-    loaded = plot.load_results(save_results(tmp_path / "run", results))
+    loaded = results_module.load_results(save_results(tmp_path / "run", results))
     jax.tree.map(
         np.testing.assert_array_equal, loaded._replace(config={}), results._replace(config={})
     )
@@ -349,12 +352,12 @@ def test_broken_results_are_named(tmp_path, name):
     folder = save_results(tmp_path / "run", fake_results())
     damage(folder)
     with pytest.raises(DataError, match=message):
-        plot.load_results(folder)
+        results_module.load_results(folder)
 
 
 def test_a_folder_that_is_not_there(tmp_path):
     with pytest.raises(DataError, match="no result folder"):
-        plot.load_results(tmp_path / "nowhere")
+        results_module.load_results(tmp_path / "nowhere")
 
 
 @pytest.fixture

@@ -1,0 +1,59 @@
+"""The whole method at toy scale: pre-train on mazes of side 9, then adapt, and be better for it."""
+
+from __future__ import annotations
+
+from functools import partial
+from itertools import islice
+
+import jax
+import numpy as np
+import pytest
+
+from envs.experts.maze import maze_demonstrators
+from envs.maze_runner import MazeRunner
+from experiments.adapt import run_adaptation
+from experiments.collect import collect
+from experiments.policies import LoadedPolicy
+from experiments.tasks import sample_tasks
+from mgpo_jax.checkpoint import network_config
+from mgpo_jax.optimizers import OPTIMIZERS
+from mgpo_jax.pretrain import TrainConfig, batch_stream, make_trainer
+from mgpo_jax.sharding import device_mesh
+
+ENV = MazeRunner(name="maze9", side=9, horizon=24)
+
+
+@pytest.fixture(scope="module")
+def trained() -> tuple[list[float], LoadedPolicy]:
+    """Losses and policy of a few hundred steps on two devices."""
+    demonstrator = maze_demonstrators(ENV)["astar4"]._replace(min_length=5)
+    dataset, _ = collect(ENV, demonstrator, 1500, seed=0)
+    config = TrainConfig(steps=400, batch_size=32, part_size=16, bucket=24, warmup_steps=20)
+    config = TrainConfig(**{**vars(config), "learning_rate": 3e-3})
+    network = network_config(ENV.spec, embed_dim=32, num_layers=2, dropout=0.0)
+    trainer = make_trainer(config, network, dataset, device_mesh(2))
+    state, losses = trainer.init(), []
+    for plans in islice(batch_stream(config, dataset, truncate=True, num_devices=2), config.steps):
+        state, metrics = trainer.step(state, plans)
+        losses.append(metrics["loss"])
+    return [float(loss) for loss in losses], LoadedPolicy(network, state.params, {})
+
+
+def test_pretraining_learns(trained: tuple[list[float], LoadedPolicy]) -> None:
+    losses, _ = trained
+    assert np.mean(losses[-50:]) < 0.6 * np.mean(losses[:10])
+
+
+@pytest.mark.parametrize("name", ["ucb", "bpe"])
+def test_adaptation_improves(trained: tuple[list[float], LoadedPolicy], name: str) -> None:
+    """On unseen mazes the optimized prompt beats the prompt (g^M), and never loses to it."""
+    tasks = sample_tasks(ENV, 77, 20)
+    outcome = run_adaptation(
+        ENV, trained[1], OPTIMIZERS[name], tasks, seeds=2, episodes=40, eval_every=20
+    )
+    initial, final = outcome.eval_returns[:, :, 0], outcome.eval_returns[:, :, -1]
+    optimum = np.asarray(jax.vmap(partial(ENV.optimal_return))(tasks))
+    assert (final >= initial - 1e-5).all()
+    assert (optimum - final >= -1e-5).all()
+    regret_before, regret_after = (optimum - initial).mean(), (optimum - final).mean()
+    assert regret_after < 0.6 * regret_before
