@@ -12,6 +12,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import jax
 import tyro
 
 from experiments.configs import PRETRAINED, make_env
@@ -21,11 +22,11 @@ from mgpo_jax.checkpoint import CONFIG, WEIGHTS, load_policy_files
 from mgpo_jax.errors import UsageError
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ReleaseConfig(Common):
     """Settings of ``experiments.release``."""
 
-    run: tyro.conf.Positional[Path]
+    source: tyro.conf.Positional[Path]
     """Folder of a finished pre-training run."""
     out: Path | None = None
     """Folder to write (default: pretrained/ENV)."""
@@ -53,25 +54,24 @@ test tasks, in no dataset). Results on them are in `results/` and the README.
 
 def main(config: ReleaseConfig) -> None:
     """Package a finished pre-training run as a released policy."""
-    source = config.run / "policy"
-    if not source.is_dir():
-        raise UsageError(f"{config.run} has no finished policy; let its training end first")
-    network, params, made = load_policy_files(source)
+    policy = config.source / "policy"
+    if not policy.is_dir():
+        raise UsageError(f"{config.source} has no finished policy; let its training end first")
+    network, params, made = load_policy_files(policy)
     env = make_env(made["env"])
     folder = new_folder(
         config.out or PRETRAINED / made["env"], "remove it", "choose another with --out"
     )
     for name in (WEIGHTS, CONFIG):
-        shutil.copy(source / name, folder / name)
+        shutil.copy(policy / name, folder / name)
     save_tasks(folder / "tasks.npz", benchmark_tasks(env))
-    rows = [json.loads(row) for row in (config.run / "metrics.jsonl").read_text().splitlines()]
+    rows = [json.loads(row) for row in (config.source / "metrics.jsonl").read_text().splitlines()]
     settings, last = made["config"], rows[-1]
     steps_between = [
         b["step"] - a for a, b in zip([0, *(r["step"] for r in rows)], rows, strict=False)
     ]
     cpu = sum(r["cpu_seconds_per_step"] * n for r, n in zip(rows, steps_between, strict=True))
-    meta = json.loads((config.run / "meta.json").read_text())
-    import jax
+    meta = json.loads((config.source / "meta.json").read_text())
 
     text = CARD.format(
         env=made["env"],

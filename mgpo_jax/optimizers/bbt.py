@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from evosax.algorithms import CMA_ES
 from jaxtyping import Array, Float, Int
 
 from mgpo_jax.optimizers.base import PromptOptimizer, SearchSpace, choose
@@ -58,7 +57,10 @@ def bbt(
       std_init: sigma(0), in units of goals: rows of A have unit norm on average [not in the paper].
     """
 
-    def strategy() -> tuple[CMA_ES, Any]:
+    def strategy() -> tuple[Any, Any]:
+        # evosax creates arrays when it is imported, before a program could choose its devices.
+        from evosax.algorithms import CMA_ES
+
         cma = CMA_ES(population_size, jnp.zeros(latent_dim), fitness_shaping_fn=rank_weights)
         return cma, cma.default_params.replace(std_init=jnp.asarray(std_init, jnp.float32))
 
