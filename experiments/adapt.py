@@ -73,8 +73,6 @@ class AdaptConfig(Common):
     """Seed of the adaptations."""
     max_goals: int | None = None
     """K, the longest prompt to try (default: what the policy was trained with) [5]."""
-    loop_erase: bool = False
-    """Draw prompts from the best trajectory without its detours (UCB, BPE, explore) [no]."""
     eval_every: int = 10
     """Episodes between evaluations of the best prompt, which are outside of the budget."""
     out: Path | None = None
@@ -115,7 +113,6 @@ def run_adaptation(
     episodes: int,
     seed: int = 0,
     max_goals: int | None = None,
-    loop_erase: bool = False,
     eval_every: int = 10,
 ) -> Outcome:
     """Adapt to every task with every seed in one compiled program, spread over the devices."""
@@ -129,12 +126,7 @@ def run_adaptation(
     def parts(params: Any) -> tuple[Any, Any]:
         policy = transformer_policy(network.config, params)
         space = SearchSpace(
-            policy.num_slots,
-            env.sample_goal,
-            env.spec.return_range,
-            episodes,
-            max_goals,
-            loop_erase,
+            policy.num_slots, env.sample_goal, env.spec.return_range, episodes, max_goals
         )
         return policy, make_optimizer(space)
 
@@ -336,7 +328,6 @@ def main(config: AdaptConfig) -> None:
         episodes=config.episodes,
         seed=config.seed,
         max_goals=config.max_goals,
-        loop_erase=config.loop_erase,
         eval_every=config.eval_every,
     )
     summary = save_results(folder, config, outcome, tasks, optimum)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from mgpo_jax.types import PRNGKeyArray, Prompt, Trajectory
 
@@ -31,7 +31,6 @@ def sample_prompt(
     final_goal: Float[Array, "G"],
     num_slots: int,
     max_goals: int | Int[Array, ""] | None = None,
-    candidates: Bool[Array, "T"] | None = None,
 ) -> Prompt:
     """Draw (g_i1, .., g_ik, final_goal) with k ~ U[0, K-1] and i1 < .. < ik from a trajectory.
 
@@ -42,7 +41,6 @@ def sample_prompt(
         adaptation the task goal g^M.
       num_slots: P, the number of slots of the returned prompt (static).
       max_goals: K <= P, the largest number of goals with the final one (traced; default P).
-      candidates: further restriction of the steps that may give a goal.
 
     Returns:
       A right-aligned prompt; goals keep the order in which the trajectory reached them.
@@ -55,8 +53,6 @@ def sample_prompt(
         trajectory.goals == trajectory.outcomes, axis=-1
     )
     eligible = trajectory.goal_reached & (time < trajectory.length) & ~repeats_end
-    if candidates is not None:
-        eligible &= candidates
 
     max_goals = num_slots if max_goals is None else max_goals
     count = jax.random.randint(key_count, (), 0, max_goals)
@@ -74,21 +70,3 @@ def sample_prompt(
         [jnp.zeros((empty, final_goal.shape[0])), trajectory.goals[drawn], final_goal[None]]
     )
     return Prompt(jnp.where(mask[:, None], goals, 0.0), mask)
-
-
-def loop_erased(goals: Float[Array, "T G"], length: Int[Array, ""]) -> Bool[Array, "T"]:
-    """Steps on the loop-erased path of a trajectory: detours that return to a goal are cut.
-
-    Waypoints drawn from these steps lie on a path that leads on, never on one that turns back.
-    """
-    num_steps = goals.shape[0]
-    time = jnp.arange(num_steps)
-    same = jnp.all(goals[:, None] == goals[None], axis=-1) & (time < length)[None]
-    last_visit = jnp.max(jnp.where(same, time[None], -1), axis=1)
-
-    def walk(resume_at: Array, t: Array) -> tuple[Array, Array]:
-        on_path = t >= resume_at
-        return jnp.where(on_path, last_visit[t] + 1, resume_at), on_path
-
-    _, on_path = jax.lax.scan(walk, jnp.zeros((), last_visit.dtype), time)
-    return on_path & (time < length)

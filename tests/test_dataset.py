@@ -168,6 +168,25 @@ def test_parts_hold_trajectories_of_nearly_equal_length():
     assert max(spreads) <= 2
 
 
+@pytest.mark.parametrize("min_part", [1, 2])
+def test_long_parts_are_halved_until_they_fit(min_part):
+    """``part_steps`` bounds the padded steps of a part; the batches stay what they were."""
+    dataset = make_dataset([1, 3, 9, 9])
+    options = {"batch_size": 16, "part_size": 8, "bucket": 3}
+    small = islice(plans(dataset, **options, part_steps=20, min_part=min_part), 6)
+    for pieces, whole in zip(small, islice(plans(dataset, **options), 6), strict=True):
+        for name in ("indices", "lengths"):
+            rows = [np.concatenate([getattr(part, name) for part in batch])
+                    for batch in (pieces, whole)]  # fmt: skip
+            np.testing.assert_array_equal(*rows)
+        for part in pieces:
+            size = len(part.lengths)
+            assert size % min_part == 0
+            assert size * part.num_steps <= 20 or size == min_part
+            # No smaller than needed.
+            assert size == 8 or 2 * size * part.num_steps > 20
+
+
 def test_seeds_differ(dataset):
     first, second = next(plans(dataset, seed=1)), next(plans(dataset, seed=2))
     assert any((a.indices != b.indices).any() for a, b in zip(first, second, strict=True))

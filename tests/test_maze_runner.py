@@ -110,7 +110,7 @@ def tasks15():
 def mazes(tiny_tasks, tasks15):
     """Generated mazes: the usual ones of two sizes, and sparse ones."""
     generate = partial(generate_maze, side=11, **SPARSE)
-    keys = jax.random.split(jax.random.key(3), 1000)
+    keys = jax.random.split(jax.random.key(3), 3000)
     return {
         "tiny": tiny_tasks.maze,
         "maze15": tasks15.maze,
@@ -392,12 +392,15 @@ class TestGenerateMaze:
         assert len(np.unique(mazes["maze15"].reshape(500, -1), axis=0)) == 500
 
     @pytest.mark.parametrize(
-        ("kind", "side", "parameters"), [("sparse", 11, SPARSE), ("maze15", 15, {})]
+        ("kind", "side", "parameters", "num"),
+        [("sparse", 11, SPARSE, 2000), ("maze15", 15, {}, 400)],
     )
-    def test_statistics_are_those_of_the_classic_procedure(self, mazes, kind, side, parameters):
+    def test_statistics_are_those_of_the_classic_procedure(
+        self, mazes, kind, side, parameters, num
+    ):
         rng = np.random.default_rng(5)
         ours = mazes[kind]
-        classic = np.stack([classic_maze(rng, side, **parameters) for _ in range(400)])
+        classic = np.stack([classic_maze(rng, side, **parameters) for _ in range(num)])
 
         # Cell by cell, the difference of two frequencies in standard deviations.
         pooled = (ours.mean(0) + classic.mean(0)) / 2

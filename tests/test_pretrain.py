@@ -73,7 +73,8 @@ def noisy_trainer():
 
 def run(trainer, state, num_steps):
     metrics = []
-    for plans in islice(batch_stream(CONFIG, DATASET, True, state.step), num_steps):
+    stream = batch_stream(CONFIG, DATASET, True, num_devices=2, first_step=state.step)
+    for plans in islice(stream, num_steps):
         state, metric = trainer.step(state, plans)
         metrics.append(jax.tree.map(float, metric))
     return state, metrics

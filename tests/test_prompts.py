@@ -1,4 +1,4 @@
-"""The prompt sampler: order, alignment, candidates and distribution; loop erasure."""
+"""The prompt sampler: order, alignment, candidates and distribution."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from mgpo_jax.prompts import hindsight_outcome, loop_erased, sample_prompt, single_goal
+from mgpo_jax.prompts import hindsight_outcome, sample_prompt, single_goal
 from mgpo_jax.types import Trajectory
 
 NUM_STEPS = 9
@@ -39,9 +39,9 @@ def make_trajectory(reached, length, ends_at_goal=False):
 
 
 @jax.jit
-def draw(seed, trajectory, max_goals, candidates):
+def draw(seed, trajectory, max_goals):
     key = jax.random.key(seed)
-    return sample_prompt(key, trajectory, FINAL, NUM_SLOTS, max_goals, candidates)
+    return sample_prompt(key, trajectory, FINAL, NUM_SLOTS, max_goals)
 
 
 @jax.jit
@@ -53,17 +53,16 @@ def draw_many(seed, trajectory, max_goals):
 @settings(max_examples=150, deadline=None)
 @given(
     reached=st.lists(st.booleans(), min_size=NUM_STEPS, max_size=NUM_STEPS),
-    allowed=st.lists(st.booleans(), min_size=NUM_STEPS, max_size=NUM_STEPS),
     length=st.integers(1, NUM_STEPS),
     max_goals=st.integers(1, NUM_SLOTS),
     ends_at_goal=st.booleans(),
     seed=st.integers(0, 2**31 - 1),
 )
 def test_every_prompt_is_an_ordered_choice_of_reached_goals(
-    reached, allowed, length, max_goals, ends_at_goal, seed
+    reached, length, max_goals, ends_at_goal, seed
 ):
     trajectory = make_trajectory(reached, length, ends_at_goal)
-    prompt = draw(seed, trajectory, jnp.int32(max_goals), jnp.asarray(allowed))
+    prompt = draw(seed, trajectory, jnp.int32(max_goals))
     goals, mask = np.asarray(prompt.goals), np.asarray(prompt.mask)
 
     count = int(mask.sum())
@@ -76,7 +75,7 @@ def test_every_prompt_is_an_ordered_choice_of_reached_goals(
     np.testing.assert_array_equal(goals[mask][:-1, 1], steps + 100)
     assert (np.diff(steps) > 0).all()
     last = length - 1 if ends_at_goal else length
-    eligible = {t for t in range(last) if reached[t] and allowed[t]}
+    eligible = {t for t in range(last) if reached[t]}
     assert set(steps) <= eligible
 
 
@@ -156,35 +155,3 @@ def test_single_goal_fills_the_last_slot():
 def test_hindsight_outcome_is_read_at_the_last_real_step():
     trajectory = make_trajectory([True] * NUM_STEPS, 5)
     np.testing.assert_array_equal(hindsight_outcome(trajectory), [5.5, 104.5])
-
-
-def erase_loops(walk):
-    """Loop erasure as defined: whenever the walk returns to its path, cut the loop at once."""
-    path = []
-    for cell in walk:
-        if cell in path:
-            del path[path.index(cell) + 1 :]
-        else:
-            path.append(cell)
-    return path
-
-
-jitted_loop_erased = jax.jit(loop_erased)
-
-
-@settings(max_examples=150, deadline=None)
-@given(
-    walk=st.lists(st.tuples(st.integers(0, 2), st.integers(0, 1)), min_size=12, max_size=12),
-    length=st.integers(1, 12),
-)
-def test_loop_erased_matches_plain_loop_erasure(walk, length):
-    on_path = np.asarray(jitted_loop_erased(jnp.asarray(walk, jnp.float32), jnp.int32(length)))
-    assert not on_path[length:].any()
-    assert [walk[t] for t in np.flatnonzero(on_path)] == erase_loops(walk[:length])
-
-
-def test_loop_erased_cuts_a_dead_end():
-    # Into the dead end at 3 and back, then on to 5.
-    walk = jnp.asarray([[0], [1], [2], [3], [2], [1], [4], [5]], jnp.float32)
-    on_path = loop_erased(walk, jnp.int32(8))
-    np.testing.assert_array_equal(np.flatnonzero(on_path), [0, 1, 6, 7])

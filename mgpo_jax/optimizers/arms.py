@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mgpo_jax.optimizers.base import PromptOptimizer, SearchSpace, choose
-from mgpo_jax.prompts import loop_erased, sample_prompt, single_goal
+from mgpo_jax.prompts import sample_prompt, single_goal
 from mgpo_jax.types import Episode, PRNGKeyArray, Prompt, Query, Trajectory
 
 MAX_ARMS = 64
@@ -124,11 +124,9 @@ def bandit(space: SearchSpace, select: Select, act_with_newest: bool = False) ->
         acts = state.episode % 2 == 1
         arm = select(key_select, state)
         chosen = state.newest if act_with_newest else state.arms.prompt(arm)
-        trajectory = state.best_trajectory
         drawn = sample_prompt(
-            key_prompt, trajectory, state.task_goal, space.num_slots, space.max_goals,
-            candidates=loop_erased(trajectory.goals, trajectory.length) if space.loop_erase else None,
-        )  # fmt: skip
+            key_prompt, state.best_trajectory, state.task_goal, space.num_slots, space.max_goals
+        )
         keeps = acts | (state.episode == 0)
         newest = choose(keeps, state.newest, drawn)
         prompt = choose(acts, chosen, newest)

@@ -45,8 +45,6 @@ class SearchSpace:
     """Budget N; sizes tables, does not stop the search."""
     max_goals: int | Int[Array, ""] | Any = None
     """K, the longest prompt to try; None means ``num_slots``."""
-    loop_erase: bool = False
-    """Draw prompts from the best trajectory without its detours (not in the paper)."""
 
     @property
     def longest(self) -> int | Int[Array, ""] | Any:
