@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from envs.experts import demonstrators
 from experiments.configs import data_root, make_env, positive
 from experiments.runtime import Common, run, versions
 from experiments.tasks import benchmark_tasks, task_hashes
-from mgpo_jax.dataset import Dataset, save_dataset
+from mgpo_jax.dataset import Dataset, hash_task, save_dataset
 from mgpo_jax.errors import UsageError, nearest
 from mgpo_jax.rollout import run_episode
 from mgpo_jax.types import Trajectory
@@ -57,27 +57,34 @@ def find_demonstrator(env: Environment, policy: str | None) -> tuple[str, Demons
     return name, known[name]
 
 
+@cache
+def demonstration_program(env: Environment, demonstrator: Demonstrator) -> Any:
+    """``keys -> (task fingerprints, trajectories, hindsight returns)``, compiled once a process."""
+
+    @jax.jit
+    @partial(jax.vmap, axis_name=LANES)
+    def demonstrate(key: jax.Array) -> tuple[jax.Array, Trajectory, jax.Array]:
+        key_task, key_episode = jax.random.split(key)
+        task = demonstrator.sample_task(key_task)
+        trajectory = run_episode(key_episode, env, demonstrator.agent, task, LANES).trajectory
+        return env.fingerprint(task), trajectory, demonstrator.hindsight_return(trajectory)
+
+    return demonstrate
+
+
 def collect(
     env: Environment, demonstrator: Demonstrator, episodes: int, seed: int
 ) -> tuple[Dataset, dict[str, Any]]:
     """Demonstrations on random tasks, none of them a test task, and facts about them."""
-
-    @jax.jit
-    @partial(jax.vmap, axis_name=LANES)
-    def demonstrate(key: jax.Array) -> tuple[Any, Trajectory, jax.Array]:
-        key_task, key_episode = jax.random.split(key)
-        task = demonstrator.sample_task(key_task)
-        trajectory = run_episode(key_episode, env, demonstrator.agent, task, LANES).trajectory
-        return task, trajectory, demonstrator.hindsight_return(trajectory)
-
+    demonstrate = demonstration_program(env, demonstrator)
     forbidden = task_hashes(env, benchmark_tasks(env))
     kept: list[tuple[Any, ...]] = []
     num_kept = num_short = num_test = batch = 0
     with tqdm(total=episodes, unit="episode", disable=None) as progress:
         while num_kept < episodes:
             key = jax.random.fold_in(jax.random.key(seed), batch)
-            tasks, trajectory, returns = jax.device_get(demonstrate(jax.random.split(key, BATCH)))
-            hashes = task_hashes(env, tasks)
+            prints, trajectory, returns = jax.device_get(demonstrate(jax.random.split(key, BATCH)))
+            hashes = np.array([hash_task(one) for one in prints], np.uint64)
             long_enough = trajectory.length >= demonstrator.min_length
             unseen = ~np.isin(hashes, forbidden)
             rows = np.flatnonzero(long_enough & unseen)[: episodes - num_kept]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,12 @@ NUM_TEST_TASKS = 50
 
 def sample_tasks(env: Environment, seed: int, num: int) -> Task:
     """``num`` random tasks, stacked on a leading axis."""
-    return jax.jit(jax.vmap(env.sample_task))(jax.random.split(jax.random.key(seed), num))
+    return _task_sampler(env)(jax.random.split(jax.random.key(seed), num))
+
+
+@cache
+def _task_sampler(env: Environment) -> Any:
+    return jax.jit(jax.vmap(env.sample_task))
 
 
 def benchmark_tasks(env: Environment, num: int = NUM_TEST_TASKS) -> Task:
