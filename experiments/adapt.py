@@ -27,7 +27,7 @@ from mgpo_jax.adapt import AdaptLog, continue_adaptation, evaluate, start_adapta
 from mgpo_jax.errors import UsageError, nearest
 from mgpo_jax.optimizers import OPTIMIZERS, SearchSpace
 from mgpo_jax.policy import transformer_policy
-from mgpo_jax.sharding import AXIS, device_mesh, split
+from mgpo_jax.sharding import AXIS, device_mesh, replicate, split
 
 LANES = "lanes"
 
@@ -165,19 +165,19 @@ def run_adaptation(
         return advance
 
     lane_tasks, keys = split(mesh, (lane_tasks, keys))
-    state = start(keys, lane_tasks, network.params)
+    params = replicate(mesh, network.params)
+    state = start(keys, lane_tasks, params)
     sizes = [eval_every] * (episodes // eval_every)
     sizes += [episodes % eval_every] if episodes % eval_every else []
     programs = {
-        size: piece(size).lower(keys, state, lane_tasks, network.params).compile()
-        for size in set(sizes)
+        size: piece(size).lower(keys, state, lane_tasks, params).compile() for size in set(sizes)
     }
     logs, evaluations = [], []
     cpu = time.process_time()
     with tqdm(total=episodes * lanes, unit="episode", disable=None) as progress:
         for number, size in enumerate(sizes):
             eval_keys = jax.vmap(partial(jax.random.fold_in, data=number))(keys)
-            state, log, returns = programs[size](eval_keys, state, lane_tasks, network.params)
+            state, log, returns = programs[size](eval_keys, state, lane_tasks, params)
             logs.append(jax.device_get(log))
             evaluations.append(np.asarray(returns))
             progress.update(size * lanes)

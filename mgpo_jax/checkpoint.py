@@ -50,8 +50,13 @@ def checkpoints(folder: Path, keep: int = 2) -> Iterator[ocp.CheckpointManager]:
 
 def save_state(manager: ocp.CheckpointManager, state: TrainState) -> None:
     """Save a training state under its step (in the background)."""
-    arrays = jax.tree.map(np.asarray, (state.params, state.opt_state))
-    manager.save(state.step, args=ocp.args.StandardSave(arrays))
+    manager.save(state.step, args=ocp.args.StandardSave(_named_leaves(state)))
+
+
+def _named_leaves(state: TrainState) -> dict[str, np.ndarray]:
+    """Leaves by path: what is on disk does not depend on the types of optax's records."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path((state.params, state.opt_state))
+    return {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in leaves}
 
 
 def restore_state(manager: ocp.CheckpointManager, blank: TrainState) -> TrainState | None:
@@ -63,19 +68,19 @@ def restore_state(manager: ocp.CheckpointManager, blank: TrainState) -> TrainSta
     step = manager.latest_step()
     if step is None:
         return None
-    shapes = jax.tree.map(np.asarray, (blank.params, blank.opt_state))
+    where = Path(manager.directory) / str(step)
     try:
-        params, opt_state = manager.restore(step, args=ocp.args.StandardRestore(shapes))
+        found = manager.restore(step, args=ocp.args.StandardRestore())
     except Exception as error:  # Orbax raises many kinds
-        where = Path(manager.directory) / str(step)
         reason = str(error).splitlines()[0]
         raise DataError(
-            f"checkpoint {where} is damaged or of another network ({reason}); remove it to go on "
-            "from the one before"
+            f"checkpoint {where} is damaged ({reason}); remove it to go on from the one before"
         ) from error
-    # The optimizer's tuples come back as the blank state's own types.
+    wanted = _named_leaves(blank)
+    if {k: v.shape for k, v in found.items()} != {k: v.shape for k, v in wanted.items()}:
+        raise DataError(f"checkpoint {where} is of another network; start a new run with --out")
+    leaves = [jnp.asarray(found[name]) for name in wanted]
     tree = jax.tree.structure((blank.params, blank.opt_state))
-    leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves((params, opt_state))]
     params, opt_state = jax.tree.unflatten(tree, leaves)
     return TrainState(params, opt_state, step)
 

@@ -18,9 +18,9 @@ from mgpo_jax.types import PRNGKeyArray
 
 @runtime_checkable
 class Distribution(Protocol):
-    """A distribution over one action."""
+    """A distribution over one action; leading axes of its parameters are axes of its results."""
 
-    def log_prob(self, action: Array) -> Float[Array, ""]: ...
+    def log_prob(self, action: Array) -> Float[Array, "*batch"]: ...
 
     def sample(self, key: PRNGKeyArray) -> Array: ...
 
@@ -32,15 +32,15 @@ class Categorical(NamedTuple):
 
     logits: Float[Array, "*batch A"]
 
-    def log_prob(self, action: Int[Array, ""]) -> Float[Array, ""]:
+    def log_prob(self, action: Int[Array, "*batch"]) -> Float[Array, "*batch"]:
         # A one-hot product instead of a gather: the gather's backward scatter is slow on CPU.
         one_hot = jax.nn.one_hot(action, self.logits.shape[-1])
         return jnp.sum(jax.nn.log_softmax(self.logits) * one_hot, axis=-1)
 
-    def sample(self, key: PRNGKeyArray) -> Int[Array, ""]:
+    def sample(self, key: PRNGKeyArray) -> Int[Array, "*batch"]:
         return jax.random.categorical(key, self.logits)
 
-    def mode(self) -> Int[Array, ""]:
+    def mode(self) -> Int[Array, "*batch"]:
         return jnp.argmax(self.logits, axis=-1)
 
 
@@ -54,15 +54,15 @@ class Gaussian(NamedTuple):
     mean: Float[Array, "*batch A"]
     log_std: Float[Array, "*batch A"]
 
-    def log_prob(self, action: Float[Array, "A"]) -> Float[Array, ""]:
+    def log_prob(self, action: Float[Array, "*batch A"]) -> Float[Array, "*batch"]:
         z = (action - self.mean) * jnp.exp(-self.log_std)
         return jnp.sum(-0.5 * z**2 - self.log_std - 0.5 * jnp.log(2 * jnp.pi), axis=-1)
 
-    def sample(self, key: PRNGKeyArray) -> Float[Array, "A"]:
+    def sample(self, key: PRNGKeyArray) -> Float[Array, "*batch A"]:
         noise = jax.random.normal(key, self.mean.shape)
         return jnp.clip(self.mean + jnp.exp(self.log_std) * noise, -1.0, 1.0)
 
-    def mode(self) -> Float[Array, "A"]:
+    def mode(self) -> Float[Array, "*batch A"]:
         return self.mean
 
 

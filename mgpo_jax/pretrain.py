@@ -187,7 +187,7 @@ def make_trainer(
         metrics = {
             "loss": stats.nll / stats.num_steps,
             "accuracy": stats.correct / stats.num_steps,
-            "grad_norm": optax.global_norm(grads),
+            "grad_norm": optax.tree.norm(grads),
             "num_steps": stats.num_steps,
         }
         return unravel(optax.apply_updates(weights, updates)), opt_state, metrics
