@@ -20,7 +20,7 @@ from tqdm import tqdm
 from envs.base import Environment, Task
 from experiments.configs import RUNS, make_env, positive
 from experiments.policies import LoadedPolicy, load_network, released_folder
-from experiments.runtime import Common, new_folder, provenance, run, write_json
+from experiments.runtime import Common, provenance, refuse_existing, run, write_json
 from experiments.statistics import seed_spread, stratified_bootstrap_iqm
 from experiments.tasks import benchmark_tasks, load_tasks, num_tasks, save_tasks
 from mgpo_jax.adapt import AdaptLog, continue_adaptation, evaluate, start_adaptation
@@ -258,7 +258,8 @@ def table(summary: dict[str, Any]) -> str:
 def save_results(
     folder: Path, config: AdaptConfig, outcome: Outcome, tasks: Task, optimum: np.ndarray
 ) -> dict[str, Any]:
-    """Write raw results, tasks, summary and provenance to an existing folder."""
+    """Write raw results, tasks, summary and provenance to a new folder."""
+    folder.mkdir(parents=True)
     log = outcome.log
     np.savez_compressed(
         folder / "results.npz",
@@ -317,7 +318,8 @@ def main(config: AdaptConfig) -> None:
             "pre-train with --max-prompt-length"
         )
     tasks = chosen_tasks(env, config.tasks)
-    folder = new_folder(config.folder, "remove it", "choose another with --out")
+    folder = config.folder
+    refuse_existing(folder, "remove it", "choose another with --out")
     optimum = np.asarray(jax.jit(jax.vmap(env.optimal_return))(tasks))
     outcome = run_adaptation(
         env,

@@ -16,10 +16,10 @@ from tqdm import tqdm
 from envs.base import Demonstrator, Environment
 from envs.experts import demonstrators
 from experiments.configs import data_root, make_env, positive
-from experiments.runtime import Common, run, versions
+from experiments.runtime import Common, refuse_existing, run, versions
 from experiments.tasks import benchmark_tasks, task_hashes
 from mgpo_jax.dataset import Dataset, hash_task, save_dataset
-from mgpo_jax.errors import UsageError, nearest
+from mgpo_jax.errors import nearest
 from mgpo_jax.rollout import run_episode
 from mgpo_jax.types import Trajectory
 
@@ -126,8 +126,7 @@ def main(config: CollectConfig) -> None:
     env = make_env(config.env)
     policy, demonstrator = find_demonstrator(env, config.policy)
     folder = dataset_folder(config, policy)
-    if folder.exists():
-        raise UsageError(f"{folder} exists already; remove it, or give another with --out")
+    refuse_existing(folder, "remove it", "choose another with --out")
     cpu = time.process_time()
     dataset, facts = collect(env, demonstrator, config.episodes, config.seed)
     cpu = time.process_time() - cpu

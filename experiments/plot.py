@@ -39,8 +39,8 @@ class PlotConfig(Common):
     """Result folders of adaptations; those of one world share its figures."""
     out: Path = Path("figures")
     """Folder to write."""
-    tasks: tuple[int, ...] = (0, 1, 2, 3)
-    """Tasks to draw on mazes, counted from 0."""
+    tasks: tuple[int, ...] = ()
+    """Tasks to draw on mazes, counted from 0 (default: the four that the first run improved most)."""
     seed: int = 0
     """Which seed of the adaptations to draw on mazes, counted from 0."""
 
@@ -70,7 +70,7 @@ def draw_run(folder: Path) -> None:
     results = {result.config["bandit"]: result}
     _save(learning_curve(results, result.config["env"]), folder / "learning_curve.png")
     if "maze" in result.tasks:
-        which = range(min(4, len(result.tasks["maze"])))
+        which = result.most_improved()
         _save(prompts_on_mazes(results, result.tasks, which), folder / "prompts.png")
 
 
@@ -104,9 +104,9 @@ def _draw_mazes(config: PlotConfig, env_name: str, results: Mapping[str, Results
     from experiments.policies import load_policy
 
     out, seed = config.out, config.seed
-    tasks = next(iter(results.values())).tasks
-    which = [index for index in config.tasks if 0 <= index < len(tasks["maze"])]
-    if not which:
+    first = next(iter(results.values()))
+    tasks, which = first.tasks, list(config.tasks) or first.most_improved()
+    if not all(0 <= index < len(tasks["maze"]) for index in which):
         raise UsageError(f"--tasks: {env_name} has the tasks 0 to {len(tasks['maze']) - 1}")
     _save(prompts_on_mazes(results, tasks, which, seed), out / f"{env_name}_prompts.png")
 

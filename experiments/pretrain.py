@@ -24,7 +24,7 @@ from envs.base import Environment
 from experiments.collect import CollectConfig, dataset_folder, find_demonstrator
 from experiments.collect import main as collect_main
 from experiments.configs import PretrainConfig, make_env, positive, pretrain_default
-from experiments.runtime import new_folder, provenance, run, to_json, write_json
+from experiments.runtime import provenance, refuse_existing, run, to_json, write_json
 from experiments.tasks import EVAL_SEED, benchmark_tasks, sample_tasks, task_hashes
 from mgpo_jax.adapt import evaluate
 from mgpo_jax.checkpoint import (
@@ -146,7 +146,7 @@ def open_run(config: PretrainConfig) -> Path:
     folder = config.folder
     saved = folder / "config.json"
     if not config.resume:
-        new_folder(folder, "continue it with --resume", "choose another with --out")
+        folder.mkdir(parents=True)
         write_json(saved, config)
         write_json(folder / "meta.json", provenance())
         return folder
@@ -176,6 +176,8 @@ def main(config: PretrainConfig) -> None:
             f"--batch-size {config.train.batch_size} is not a multiple of --part-size "
             f"{config.train.part_size}"
         )
+    if not config.resume:
+        refuse_existing(config.folder, "continue it with --resume", "choose another with --out")
     env = make_env(config.env)
     network = network_config(
         env.spec,

@@ -16,7 +16,7 @@ import jax
 import tyro
 
 from experiments.configs import PRETRAINED, make_env
-from experiments.runtime import Common, new_folder, run
+from experiments.runtime import Common, refuse_existing, run
 from experiments.tasks import benchmark_tasks, save_tasks
 from mgpo_jax.checkpoint import CONFIG, WEIGHTS, load_policy_files
 from mgpo_jax.errors import UsageError
@@ -59,9 +59,9 @@ def main(config: ReleaseConfig) -> None:
         raise UsageError(f"{config.source} has no finished policy; let its training end first")
     network, params, made = load_policy_files(policy)
     env = make_env(made["env"])
-    folder = new_folder(
-        config.out or PRETRAINED / made["env"], "remove it", "choose another with --out"
-    )
+    folder = config.out or PRETRAINED / made["env"]
+    refuse_existing(folder, "remove it", "choose another with --out")
+    folder.mkdir(parents=True)
     for name in (WEIGHTS, CONFIG):
         shutil.copy(policy / name, folder / name)
     save_tasks(folder / "tasks.npz", benchmark_tasks(env))

@@ -37,6 +37,11 @@ class Results(NamedTuple):
         index = (seed, task, last - 1)
         return Prompt(jnp.asarray(self.best_goals[index]), jnp.asarray(self.best_masks[index]))
 
+    def most_improved(self, num: int = 4) -> list[int]:
+        """The tasks whose return adaptation raised most, over all seeds, the largest gain first."""
+        gains = (self.eval_returns[:, :, -1] - self.eval_returns[:, :, 0]).mean(axis=0)
+        return np.argsort(-gains, kind="stable")[:num].tolist()
+
 
 FILES = ("results.npz", "tasks.npz", "config.json", "summary.json")
 AXES = {

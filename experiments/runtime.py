@@ -109,16 +109,10 @@ def peek(argv: Sequence[str], flag: str, fallback: str) -> str:
     return fallback
 
 
-def new_folder(folder: Path, *ways_out: str) -> Path:
-    """Create an output folder.
-
-    Raises:
-      UsageError: if it exists; names the ways out.
-    """
+def refuse_existing(folder: Path, *ways_out: str) -> None:
+    """Raise ``UsageError`` with the ways out if an output folder exists."""
     if folder.exists():
         raise UsageError(f"{folder} exists already; {', or '.join(ways_out)}")
-    folder.mkdir(parents=True)
-    return folder
 
 
 def to_json(value: Any) -> Any:
