@@ -16,6 +16,7 @@ import jax
 import tyro
 
 from experiments.configs import PRETRAINED, make_env
+from experiments.figures import training_curve
 from experiments.runtime import Common, refuse_existing, run
 from experiments.tasks import benchmark_tasks, save_tasks
 from mgpo_jax.checkpoint import CONFIG, WEIGHTS, load_policy_files
@@ -47,8 +48,10 @@ Made by
 
     {command}
 
+![loss and return of the initial prompt while training](training.png)
+
 Files: `weights.npz`, `config.json` (network, SHA-256 of the weights, all settings), `tasks.npz` (the
-test tasks, in no dataset). Results on them are in `results/` and the README.
+test tasks, in no dataset), `metrics.jsonl`. Results on them are in `results/` and the README.
 """
 
 
@@ -64,6 +67,8 @@ def main(config: ReleaseConfig) -> None:
     folder.mkdir(parents=True)
     for name in (WEIGHTS, CONFIG):
         shutil.copy(policy / name, folder / name)
+    shutil.copy(config.source / "metrics.jsonl", folder)
+    training_curve(folder / "metrics.jsonl").savefig(folder / "training.png")
     save_tasks(folder / "tasks.npz", benchmark_tasks(env))
     rows = [json.loads(row) for row in (config.source / "metrics.jsonl").read_text().splitlines()]
     settings, last = made["config"], rows[-1]
