@@ -25,10 +25,10 @@ ENV = MazeRunner(name="maze9", side=9, horizon=24)
 
 @pytest.fixture(scope="module")
 def trained() -> tuple[list[float], LoadedPolicy]:
-    """Losses and policy of a few hundred steps on two devices."""
+    """Losses and policy of 1,500 small steps on two devices."""
     demonstrator = maze_demonstrators(ENV)["astar4"]._replace(min_length=5)
-    dataset, _ = collect(ENV, demonstrator, 1500, seed=0)
-    config = TrainConfig(steps=400, batch_size=32, part_size=16, bucket=24, warmup_steps=20)
+    dataset, _ = collect(ENV, demonstrator, 3000, seed=0)
+    config = TrainConfig(steps=1500, batch_size=32, part_size=16, bucket=24, warmup_steps=20)
     config = TrainConfig(**{**vars(config), "learning_rate": 3e-3})
     network = network_config(ENV.spec, embed_dim=32, num_layers=2, dropout=0.0)
     trainer = make_trainer(config, network, dataset, device_mesh(2))
@@ -56,4 +56,4 @@ def test_adaptation_improves(trained: tuple[list[float], LoadedPolicy], name: st
     assert (final >= initial - 1e-5).all()
     assert (optimum - final >= -1e-5).all()
     regret_before, regret_after = (optimum - initial).mean(), (optimum - final).mean()
-    assert regret_after < 0.6 * regret_before
+    assert regret_after < 0.5 * regret_before
