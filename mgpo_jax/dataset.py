@@ -117,6 +117,8 @@ def load_dataset(folder: Path, spec: EnvSpec | None = None) -> tuple[Dataset, di
         manifest = json.loads((folder / MANIFEST).read_text())
     except ValueError:
         raise DataError(f"{folder / MANIFEST} is not readable JSON; {remake}") from None
+    if not isinstance(manifest, dict):
+        raise DataError(f"{folder / MANIFEST} does not hold a JSON object; {remake}")
     if manifest.get("format") != FORMAT:
         raise DataError(
             f"{folder} has format {manifest.get('format')}, this version reads {FORMAT}"
@@ -127,7 +129,7 @@ def load_dataset(folder: Path, spec: EnvSpec | None = None) -> tuple[Dataset, di
     try:
         with np.load(path, allow_pickle=False) as file:
             dataset = Dataset(**file)
-    except (OSError, ValueError, TypeError, KeyError, zipfile.BadZipFile):
+    except (OSError, EOFError, ValueError, TypeError, KeyError, zipfile.BadZipFile):
         raise DataError(f"{path} does not hold the arrays of a dataset; {remake}") from None
     check_dataset(dataset, path, spec)
     return dataset, manifest
@@ -135,14 +137,19 @@ def load_dataset(folder: Path, spec: EnvSpec | None = None) -> tuple[Dataset, di
 
 def check_dataset(dataset: Dataset, where: Path | str, spec: EnvSpec | None = None) -> None:
     """Raise ``DataError`` with the first thing that is wrong with a dataset."""
+    if dataset.lengths.ndim != 1 or not np.issubdtype(dataset.lengths.dtype, np.integer):
+        raise DataError(f"{where}: lengths must be a list of integers")
+    if dataset.task_hashes.shape != dataset.lengths.shape:
+        hashes = dataset.task_hashes.size
+        raise DataError(f"{where}: {hashes} task hashes for {len(dataset)} trajectories")
     total = int(dataset.lengths.sum())
     if len(dataset) == 0 or dataset.lengths.min() < 1:
         raise DataError(f"{where}: every trajectory needs at least one step")
     for name in Trajectory._fields[:-1]:
         array = getattr(dataset, name)
-        if len(array) != total:
+        if array.ndim == 0 or len(array) != total:
             raise DataError(
-                f"{where}: {name} has {len(array)} steps, the lengths add up to {total}"
+                f"{where}: {name} has shape {list(array.shape)}, the lengths add up to {total} steps"
             )
         if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
             step = int(np.argwhere(~np.isfinite(array))[0][0])

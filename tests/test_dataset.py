@@ -279,7 +279,7 @@ ARRAY_DAMAGE = {
     ),
     "too few steps": (
         lambda a: a.update(actions=a["actions"][:-1]),
-        "actions has 16 steps, the lengths add up to 17",
+        "lengths add up to 17 steps",
     ),
     "empty trajectory": (
         lambda a: a["lengths"].__setitem__(slice(2), [4, 0]),
