@@ -310,8 +310,16 @@ ARRAY_DAMAGE = {
         r"actions must lie in 0\.\.3",
     ),
     "negative action": (lambda a: a["actions"].__setitem__(3, -1), "actions must lie in"),
+    "missing hashes": (
+        lambda a: a.update(task_hashes=a["task_hashes"][:1]),
+        "1 task hashes for",
+    ),
+    "fractional lengths": (
+        lambda a: a.update(lengths=a["lengths"].astype(np.float32)),
+        "lengths must be a list of integers",
+    ),
     "too long": (
-        lambda a: a.update(lengths=np.array([3, 14], np.int32)),
+        lambda a: a.update(lengths=np.array([3, 14], np.int32), task_hashes=a["task_hashes"][:2]),
         "a trajectory has 14 steps, the horizon of toy is 9",
     ),
 }
