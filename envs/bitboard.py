@@ -87,7 +87,10 @@ def distances(free: Bool[Array, "S S"], source: Int[Array, "2"]) -> Int[Array, "
 def toward(
     free: Bool[Array, "S S"], source: Int[Array, "2"], target: Int[Array, "2"]
 ) -> Bool[Array, "S S"]:
-    """The neighbors of ``source`` on shortest free paths from it to ``target`` (none if cut off)."""
+    """The neighbors of ``source`` on shortest free paths from it to another cell ``target``.
+
+    None if the target is cut off.
+    """
     side = free.shape[0]
     origin = single(target, side)
     neighbors = spread(single(source, side)) & ~single(source, side)
