@@ -89,11 +89,15 @@ class MazeRunner:
 
     def optimal_return(self, task: MazeTask) -> Float[Array, ""]:
         """1 - 0.1 x shortest path (worst return where the goal is too far or cut off)."""
-        length = distances(task.maze == 0, jnp.asarray(self.start))[tuple(task.goal)]
+        length = self._shortest_path(task)
         reachable = (length >= 0) & (length <= self.horizon)
         return jnp.where(
             reachable, GOAL_REWARD - STEP_PENALTY * length, -STEP_PENALTY * self.horizon
         )
+
+    def _shortest_path(self, task: MazeTask) -> Int[Array, ""]:
+        """Steps from the start to the goal; -1 where it is cut off."""
+        return distances(task.maze == 0, jnp.asarray(self.start))[tuple(task.goal)]
 
     def fingerprint(self, task: MazeTask) -> Int[Array, "F"]:
         """The walls: a test maze must not occur in training with any goal."""
@@ -120,6 +124,10 @@ class MazeRunner:
                 raise ValueError(f"task {index}: goal ({row}, {column}) is not a free cell")
             if (row, column) == start:
                 raise ValueError(f"task {index}: goal ({row}, {column}) is the start cell")
+        batch = MazeTask(jnp.asarray(maze), jnp.asarray(goal))
+        for index, steps in enumerate(jax.vmap(self._shortest_path)(batch).tolist()):
+            if steps < 0:
+                raise ValueError(f"task {index}: no free path leads from the start to the goal")
 
     def reset(self, key: PRNGKeyArray, task: MazeTask) -> tuple[MazeState, TimeStep]:
         del key  # the start is always the same

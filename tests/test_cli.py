@@ -257,6 +257,14 @@ def broken(tasks: Any, **changes: Any) -> dict[str, np.ndarray]:
     return {**{k: np.array(v) for k, v in tasks._asdict().items()}, **changes}
 
 
+def walled_in(tasks: Any) -> np.ndarray:
+    """Nothing is free but start and goal."""
+    maze = np.ones_like(tasks.maze)
+    maze[:, 13, 7] = 0
+    maze[np.arange(len(maze)), tasks.goal[:, 0], tasks.goal[:, 1]] = 0
+    return maze
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -267,6 +275,7 @@ def broken(tasks: Any, **changes: Any) -> dict[str, np.ndarray]:
         (lambda t: {"goal": np.full_like(t.goal, 99)}, "is not a free cell"),
         (lambda t: {"goal": t.goal + 0.5}, "integers"),
         (lambda t: {"goal": t.goal[:1]}, "shape [2, 2]"),
+        (lambda t: {"maze": walled_in(t)}, "no free path leads from the start"),
         (lambda t: {"maze": t.maze * np.nan}, "0 (free) and 1 (wall) only"),
     ],
 )
