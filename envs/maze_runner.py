@@ -197,7 +197,7 @@ def generate_maze(
     grows a wall from it: ``complexity * 10 * side`` times it looks at a random even cell two steps
     away and, if that is free, walls it with the cell between and goes on from there. Most looks find
     a wall and change nothing. Here one loop step is one *change*: the number of looks it took is
-    drawn from its geometric distribution, so mazes have the same distribution at a hundredth of the
+    drawn from its geometric distribution, so mazes have the same distribution at a small part of the
     steps.
     """
     num_islands = int(density * (side // 2) * (side // 2))

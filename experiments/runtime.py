@@ -4,7 +4,7 @@ Settings that matter on a CPU, all in one place:
 
 - One XLA device a core. The programs here are small; one on each core wastes less than one on all.
 - The C library keeps large blocks instead of returning them to the kernel: a gradient step frees and
-  allocates hundreds of MB, and page faults would cost it some 10 to 30 %.
+  allocates hundreds of MB, and every page that comes back from the kernel costs a fault.
 - jax's persistent compilation cache (``~/.cache/mgpo_jax``, or ``$MGPO_CACHE``): the second run of a
   command starts in seconds.
 """

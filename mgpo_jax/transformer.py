@@ -49,11 +49,6 @@ class TransformerConfig:
     prompt_order: bool = True
     """Whether prompt slots carry a position embedding (the paper's network: False)."""
 
-    @property
-    def sequence_length(self) -> int:
-        """Tokens of a full sequence: K goals, T observations and T - 1 actions."""
-        return self.max_prompt_length + 2 * self.horizon - 1
-
 
 class KVCache(NamedTuple):
     """Keys and values of the tokens seen so far, for each layer; ``step`` is the next timestep."""
@@ -123,7 +118,7 @@ def _attention_by_row(
     value: Float[Array, "H S E"],
     visible: Bool[Array, "R S"],
 ) -> Float[Array, "R HE"]:
-    """The same for a few queries: matrix-vector products, which XLA's CPU backend runs some eight
+    """The same for a few queries: matrix-vector products, which XLA's CPU backend runs several
     times faster than products with a matrix of two rows."""
 
     def of_head(query: Array, key: Array, value: Array, visible: Array) -> Array:

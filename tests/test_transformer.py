@@ -199,7 +199,6 @@ def test_sizes_of_table_6(horizon, head):
     assert all(output.shape == (horizon, 5) for output in outputs)
     count = sum(leaf.size for leaf in jax.tree.leaves(params))
     assert 0.57e6 < count - horizon * config.embed_dim < 0.63e6
-    assert config.sequence_length == 5 + 2 * horizon - 1
 
 
 def test_dropout_only_when_asked_for(params, full):
