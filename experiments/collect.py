@@ -59,13 +59,16 @@ def find_demonstrator(env: Environment, policy: str | None) -> tuple[str, Demons
 
 @cache
 def demonstration_program(env: Environment, demonstrator: Demonstrator) -> Any:
-    """``keys -> (task fingerprints, trajectories, hindsight returns)``, compiled once a process."""
+    """``(keys, indices) -> (task fingerprints, trajectories, hindsight returns)``.
+
+    Compiled once a process.
+    """
 
     @jax.jit
     @partial(jax.vmap, axis_name=LANES)
-    def demonstrate(key: jax.Array) -> tuple[jax.Array, Trajectory, jax.Array]:
+    def demonstrate(key: jax.Array, index: jax.Array) -> tuple[jax.Array, Trajectory, jax.Array]:
         key_task, key_episode = jax.random.split(key)
-        task = demonstrator.sample_task(key_task)
+        task = demonstrator.sample_task(key_task, index)
         trajectory = run_episode(key_episode, env, demonstrator.agent, task, LANES).trajectory
         return env.fingerprint(task), trajectory, demonstrator.hindsight_return(trajectory)
 
@@ -82,8 +85,9 @@ def collect(
     num_kept = num_short = num_test = batch = 0
     with tqdm(total=episodes, unit="episode", disable=None) as progress:
         while num_kept < episodes:
-            key = jax.random.fold_in(jax.random.key(seed), batch)
-            prints, trajectory, returns = jax.device_get(demonstrate(jax.random.split(key, BATCH)))
+            keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), batch), BATCH)
+            indices = batch * BATCH + np.arange(BATCH)
+            prints, trajectory, returns = jax.device_get(demonstrate(keys, indices))
             hashes = np.array([hash_task(one) for one in prints], np.uint64)
             long_enough = trajectory.length >= demonstrator.min_length
             unseen = ~np.isin(hashes, forbidden)

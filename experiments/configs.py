@@ -101,42 +101,62 @@ class PretrainConfig(Common):
         return self.out or RUNS / "pretrain" / self.env / name
 
 
-# Jitted mazes make demonstrations cheaper than regularization: 10,000 trajectories are overfitted after
-# 5,000 fast steps, 100,000 take a minute to collect and are not.
-FAST_EPISODES = {"maze15": 100_000, "maze30": 10_000}
-
 PRESETS = ("fast", "paper", "smoke")
 
-# Steps of the authors' code (their text gives none), and of the fast recipe.
-PAPER_STEPS = {"maze15": 50_000, "maze30": 200_000}
+
+@dataclass(frozen=True)
+class Recipe:
+    """What differs between the trainings of two worlds."""
+
+    steps: int
+    episodes: int
+    max_prompt_length: int
+    bucket: int
+    save_every: int = 500
+
+
+# Demonstrations are cheaper than regularization: 10,000 of maze15 are overfitted after 5,000 fast steps,
+# 100,000 take a minute to collect and are not.
 FAST = {
-    "maze15": TrainConfig(steps=20_000),
-    "maze30": TrainConfig(steps=20_000, bucket=32),
+    "maze15": Recipe(steps=20_000, episodes=100_000, max_prompt_length=5, bucket=4),
+    "maze30": Recipe(steps=6_000, episodes=30_000, max_prompt_length=10, bucket=32, save_every=250),
+}
+
+# Steps of the authors' code; their text gives none.
+PAPER = {
+    "maze15": Recipe(steps=50_000, episodes=10_000, max_prompt_length=5, bucket=4),
+    "maze30": Recipe(steps=200_000, episodes=10_000, max_prompt_length=5, bucket=32),
 }
 
 
 def pretrain_preset(env: str, preset: str) -> PretrainConfig:
     """The default settings for a world."""
     make_env(env)  # complains about an unknown name
-    if preset == "fast":
-        data = DataConfig(episodes=FAST_EPISODES[env])
-        return PretrainConfig(env=env, preset=preset, data=data, train=FAST[env])
+    if preset not in PRESETS:
+        raise nearest(preset, PRESETS, "preset")
+    recipe = (PAPER if preset == "paper" else FAST)[env]
+    fast = PretrainConfig(
+        env=env,
+        preset=preset,
+        data=DataConfig(episodes=recipe.episodes),
+        train=TrainConfig(steps=recipe.steps, bucket=recipe.bucket),
+        max_prompt_length=recipe.max_prompt_length,
+        save_every=recipe.save_every,
+    )
     if preset == "paper":
         train = replace(
-            FAST[env],
-            steps=PAPER_STEPS[env],
+            fast.train,
             learning_rate=1e-4,
             warmup_steps=10_000,
             schedule="constant",
             clip_norm=0.25,
         )
-        return PretrainConfig(env=env, preset=preset, train=train, dropout=0.1, prompt_order=False)
+        return replace(fast, train=train, dropout=0.1, prompt_order=False)
     if preset == "smoke":
-        return PretrainConfig(
-            env=env,
-            preset=preset,
+        return replace(
+            fast,
             data=DataConfig(episodes=256),
-            train=replace(FAST[env], steps=40, warmup_steps=10, bucket=FAST[env].bucket * 8),
+            train=replace(fast.train, steps=40, warmup_steps=10, bucket=8 * recipe.bucket),
             embed_dim=32,
             num_layers=2,
             holdout=32,
@@ -144,7 +164,7 @@ def pretrain_preset(env: str, preset: str) -> PretrainConfig:
             eval_every=20,
             save_every=20,
         )
-    raise nearest(preset, PRESETS, "preset")
+    return fast
 
 
 def pretrain_default(argv: Sequence[str]) -> PretrainConfig:
