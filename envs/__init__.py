@@ -6,6 +6,7 @@ import difflib
 from collections.abc import Callable
 
 from envs.base import Environment, EnvSpec, TimeStep
+from envs.grid_world import GridWorld
 from envs.maze_runner import MazeRunner
 
 __all__ = ["ENVIRONMENTS", "EnvSpec", "Environment", "TimeStep", "make"]
@@ -14,6 +15,7 @@ __all__ = ["ENVIRONMENTS", "EnvSpec", "Environment", "TimeStep", "make"]
 ENVIRONMENTS: dict[str, Callable[[], Environment]] = {
     "maze15": lambda: MazeRunner(name="maze15", side=15, horizon=64),
     "maze30": lambda: MazeRunner(name="maze30", side=31, horizon=500),
+    "gridworld": lambda: GridWorld(name="gridworld", horizon=90),
 }
 
 

@@ -29,6 +29,8 @@ class EnvSpec:
       return_range: smallest and largest possible return; the optimizers scale by it.
       truncate_in_hindsight: whether a trajectory cut at any step is a trajectory to another
         task goal (paper, appendix D: true in MazeRunner, where every position is a goal).
+      deterministic: whether task and actions determine an episode; if not, one greedy episode is
+        only a sample of what a prompt is worth.
     """
 
     name: str
@@ -39,6 +41,7 @@ class EnvSpec:
     horizon: int
     return_range: tuple[float, float]
     truncate_in_hindsight: bool
+    deterministic: bool
 
 
 class TimeStep(NamedTuple):
@@ -115,7 +118,7 @@ class Demonstrator(NamedTuple):
     """Where a dataset comes from: tasks to demonstrate and the agent that does."""
 
     sample_task: Callable
-    """``key -> task``."""
+    """``(key, index) -> task`` of the index-th demonstration."""
     agent: Agent
     min_length: int
     """Demonstrations with fewer steps are dropped."""

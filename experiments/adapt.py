@@ -57,7 +57,7 @@ class AdaptConfig(Common):
     """Settings of ``experiments.adapt``; values in brackets are the paper's."""
 
     env: str = "maze15"
-    """The world: maze15, maze30."""
+    """The world: maze15, maze30 or gridworld."""
     bandit: str = "ucb"
     """The prompt optimizer: ucb, bpe, explore, grips or bbt."""
     policy: Path | None = None

@@ -39,7 +39,7 @@ class BenchConfig(Common):
     """Settings of ``experiments.bench``."""
 
     env: str = "maze15"
-    """The world: maze15, maze30."""
+    """The world: maze15, maze30 or gridworld."""
     quick: bool = False
     """A tenth of the work: shows that it runs, gives rough numbers."""
     episodes: int | None = None

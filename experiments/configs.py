@@ -51,7 +51,7 @@ class DataConfig:
     demonstrator: Annotated[str | None, tyro.conf.arg(name="policy")] = None
     """Who collects it: astar1, astar2, astar4 or random in mazes (default: the world's first)."""
     episodes: int = 10_000
-    """Trajectories kept [10,000 in mazes]."""
+    """Trajectories kept [10,000 in mazes, 13,600 in gridworld]."""
     data_seed: Annotated[int, tyro.conf.arg(name="data-seed")] = 0
     """Seed of the dataset."""
 
@@ -61,13 +61,13 @@ class PretrainConfig(Common):
     """Settings of ``experiments.pretrain``; values in brackets are the paper's."""
 
     env: str = "maze15"
-    """The world: maze15, maze30."""
+    """The world: maze15, maze30 or gridworld."""
     preset: str = "fast"
     """Where the defaults below come from: fast, paper or smoke."""
     data: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
     train: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
     max_prompt_length: int = 5
-    """K, the longest prompt [5]."""
+    """K, the longest prompt [5 in mazes, 8 in gridworld]."""
     dropout: float = 0.0
     """Dropout rate [0.1]."""
     prompt_order: bool = True
@@ -81,7 +81,7 @@ class PretrainConfig(Common):
     holdout: int = 200
     """Trajectories kept out of training for the validation loss."""
     eval_tasks: int = 64
-    """Tasks of the greedy evaluation on the way (neither training nor test tasks)."""
+    """Tasks of the greedy evaluation on the way (no test tasks)."""
     eval_every: int = 1_000
     """Steps between evaluations."""
     save_every: int = 500
@@ -120,12 +120,15 @@ class Recipe:
 FAST = {
     "maze15": Recipe(steps=20_000, episodes=100_000, max_prompt_length=5, bucket=4),
     "maze30": Recipe(steps=6_000, episodes=30_000, max_prompt_length=10, bucket=32, save_every=250),
+    # Each of the 13,600 training tasks five times.
+    "gridworld": Recipe(steps=8_000, episodes=68_000, max_prompt_length=8, bucket=8),
 }
 
 # Steps of the authors' code; their text gives none.
 PAPER = {
     "maze15": Recipe(steps=50_000, episodes=10_000, max_prompt_length=5, bucket=4),
     "maze30": Recipe(steps=200_000, episodes=10_000, max_prompt_length=5, bucket=32),
+    "gridworld": Recipe(steps=50_000, episodes=13_600, max_prompt_length=8, bucket=8),
 }
 
 

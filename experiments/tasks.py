@@ -30,8 +30,13 @@ def _task_sampler(env: Environment) -> Any:
 
 
 def benchmark_tasks(env: Environment, num: int = NUM_TEST_TASKS) -> Task:
-    """The test tasks of a world: the same for everyone, and in no dataset."""
-    return sample_tasks(env, TEST_SEED, num)
+    """The test tasks of a world, all different: the same for everyone, and in no dataset."""
+    drawn = sample_tasks(env, TEST_SEED, 2 * num)
+    _, first = np.unique(task_hashes(env, drawn), return_index=True)
+    if len(first) < num:
+        raise ValueError(f"{env.spec.name} has too few tasks to test on {num} different ones")
+    chosen = np.sort(first)[:num]
+    return jax.tree.map(lambda leaf: leaf[chosen], drawn)
 
 
 def task_hashes(env: Environment, tasks: Task) -> np.ndarray:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from envs.base import Demonstrator, Environment
+from envs.experts.grid import grid_demonstrators
 from envs.experts.maze import maze_demonstrators
+from envs.grid_world import GridWorld
 from envs.maze_runner import MazeRunner
 
 __all__ = ["demonstrators"]
@@ -14,4 +16,6 @@ def demonstrators(env: Environment) -> dict[str, Demonstrator]:
     if isinstance(env, MazeRunner):
         known = maze_demonstrators(env)
         return {"astar4": known["astar4"], **known}
+    if isinstance(env, GridWorld):
+        return grid_demonstrators(env)
     raise TypeError(f"no demonstrators for {type(env).__name__}")

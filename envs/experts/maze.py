@@ -143,8 +143,9 @@ def first_hit_return(trajectory: Any) -> Float[Array, ""]:
 def maze_demonstrators(env: MazeRunner) -> dict[str, Demonstrator]:
     """The datasets of Table 5 by name."""
 
-    def endless_task(key: PRNGKeyArray) -> MazeTask:
+    def endless_task(key: PRNGKeyArray, index: Int[Array, ""]) -> MazeTask:
         """A random maze whose goal is a wall, so that only the demonstrator ends the episode."""
+        del index
         return MazeTask(generate_maze(key, env.side), jnp.zeros(2, jnp.int32))
 
     agents = {

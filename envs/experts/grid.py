@@ -1,0 +1,58 @@
+"""The demonstrator of GridWorld: it knows the order (paper, appendix C.3).
+
+It walks to the next object of the task and switches it on; where both rows and columns are left to go,
+it chooses the axis at random, as the authors' expert does.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PRNGKeyArray
+
+from envs.base import Agent, Demonstrator, TimeStep
+from envs.grid_world import EAST, FLIP, NORTH, OBJECTS, SOUTH, WEST, GridState, GridTask, GridWorld
+
+
+def switcher() -> Agent:
+    """The demonstrator; the episode ends with the last object of the task."""
+
+    def begin(
+        key: PRNGKeyArray, task: GridTask, state: GridState, timestep: TimeStep
+    ) -> tuple[Array, Array, tuple]:
+        del task
+        return proceed(key, (), state, timestep)
+
+    def proceed(
+        key: PRNGKeyArray, memory: tuple, state: GridState, timestep: TimeStep
+    ) -> tuple[Array, Array, tuple]:
+        del timestep
+        target = jnp.asarray(OBJECTS)[state.task.order[state.num_solved]]
+        down, right = target - state.position
+        along_column = jnp.where(down > 0, SOUTH, NORTH)
+        along_row = jnp.where(right > 0, EAST, WEST)
+        vertical = jnp.where(right == 0, True, (down != 0) & jax.random.bernoulli(key))
+        move = jnp.where(vertical, along_column, along_row)
+        action = jnp.where((down == 0) & (right == 0), FLIP, move)
+        return action, jnp.zeros((), bool), memory
+
+    return Agent(begin, proceed)
+
+
+def grid_demonstrators(env: GridWorld) -> dict[str, Demonstrator]:
+    """The dataset of the paper: every ordered task in turn."""
+
+    def hindsight_return(trajectory: Any) -> Array:
+        """1: it switches on what the task names, in its order."""
+        del trajectory
+        return jnp.ones(())
+
+    expert = Demonstrator(
+        sample_task=lambda key, index: env.task(index),
+        agent=switcher(),
+        min_length=1,
+        hindsight_return=hindsight_return,
+    )
+    return {"expert": expert}
