@@ -114,7 +114,7 @@ class GridWorld:
             raise ValueError(f"order must hold objects 0..{NUM_OBJECTS - 1}, or {NONE} at the end")
         for index, row in enumerate(order):
             objects = row[row != NONE]
-            if not MIN_SUBTASKS <= len(objects):
+            if len(objects) < MIN_SUBTASKS:
                 raise ValueError(
                     f"task {index}: {len(objects)} objects, an order has at least {MIN_SUBTASKS}"
                 )

@@ -3,33 +3,25 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
-from jax.sharding import PartitionSpec
-from tqdm import tqdm
 
 from envs.base import Environment, Task
+from experiments.adaptation import Outcome, run_adaptation
 from experiments.configs import RUNS, make_env, positive
-from experiments.policies import LoadedPolicy, load_network, released_folder
+from experiments.policies import load_network, released_folder
 from experiments.runtime import Common, provenance, refuse_existing, run, write_json
 from experiments.statistics import seed_spread, stratified_bootstrap_iqm
-from experiments.tasks import benchmark_tasks, load_tasks, num_tasks, save_tasks
-from mgpo_jax.adapt import AdaptLog, continue_adaptation, evaluate, start_adaptation
+from experiments.tasks import benchmark_tasks, load_tasks, save_tasks
 from mgpo_jax.errors import UsageError, nearest
-from mgpo_jax.optimizers import OPTIMIZERS, SearchSpace
-from mgpo_jax.policy import transformer_policy
-from mgpo_jax.sharding import AXIS, device_mesh, replicate, split
-
-LANES = "lanes"
+from mgpo_jax.optimizers import OPTIMIZERS
 
 
 @dataclass(frozen=True)
@@ -75,6 +67,9 @@ class AdaptConfig(Common):
     """K, the longest prompt to try (default: what the policy was trained with) [5]."""
     eval_every: int = 10
     """Episodes between evaluations of the best prompt, which are outside of the budget."""
+    eval_episodes: int | None = None
+    """Greedy episodes that an evaluation averages (default: 1 where task and actions determine an
+    episode, else 20)."""
     out: Path | None = None
     """Result folder (default: runs/adapt/ENV/BANDIT-seedSEED)."""
     figures: bool = True
@@ -86,112 +81,6 @@ class AdaptConfig(Common):
     @property
     def folder(self) -> Path:
         return self.out or RUNS / "adapt" / self.env / f"{self.bandit}-seed{self.seed}"
-
-
-class Outcome(NamedTuple):
-    """Raw results, axes S seeds, N tasks, E episodes, C evaluations."""
-
-    log: AdaptLog
-    """Leaves [S, N, E, ..]."""
-    eval_episodes: np.ndarray
-    """[C]: after how many episodes the best prompt was evaluated."""
-    eval_returns: np.ndarray
-    """[S, N, C] greedy returns of the best prompt; the first is that of the prompt (g^M)."""
-    num_episodes: int
-    """All episodes that were run, searches and evaluations."""
-    cpu_seconds: float
-    """CPU time of all of them, without compilation."""
-
-
-def run_adaptation(
-    env: Environment,
-    network: LoadedPolicy,
-    make_optimizer: Callable[[SearchSpace], Any],
-    tasks: Task,
-    *,
-    seeds: int,
-    episodes: int,
-    seed: int = 0,
-    max_goals: int | None = None,
-    eval_every: int = 10,
-) -> Outcome:
-    """Adapt to every task with every seed in one compiled program, spread over the devices."""
-    num, mesh = num_tasks(tasks), device_mesh()
-    lanes = seeds * num
-    padded = -(-lanes // mesh.devices.size) * mesh.devices.size
-    index = jnp.arange(padded) % num  # lanes beyond the last seed only fill up the devices
-    lane_tasks = jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], tasks)
-    keys = jax.random.split(jax.random.key(seed), padded)
-
-    def parts(params: Any) -> tuple[Any, Any]:
-        policy = transformer_policy(network.config, params)
-        space = SearchSpace(
-            policy.num_slots, env.sample_goal, env.spec.return_range, episodes, max_goals
-        )
-        return policy, make_optimizer(space)
-
-    def over_lanes(function: Callable) -> Any:
-        """Run for every lane, a share of them on each device; the last argument is shared."""
-        spec = PartitionSpec(AXIS)
-
-        def on_device(*args: Any) -> Any:
-            in_axes = (0,) * (len(args) - 1) + (None,)
-            return jax.vmap(function, in_axes=in_axes, axis_name=LANES)(*args)
-
-        def call(*args: Any) -> Any:
-            in_specs = (spec,) * (len(args) - 1) + (PartitionSpec(),)
-            return jax.shard_map(
-                on_device, mesh=mesh, in_specs=in_specs, out_specs=spec, check_vma=False
-            )(*args)
-
-        return jax.jit(call)
-
-    @over_lanes
-    def start(key: Any, task: Task, params: Any) -> Any:
-        return start_adaptation(key, env, *parts(params), task)
-
-    def piece(num_episodes: int) -> Any:
-        """Some episodes of the search, then an evaluation of the best prompt."""
-
-        @over_lanes
-        def advance(key: Any, state: Any, task: Task, params: Any) -> Any:
-            policy, optimizer = parts(params)
-            state, log = continue_adaptation(
-                state, env, policy, optimizer, task, num_episodes, LANES
-            )
-            best = optimizer.best(state.optimizer)
-            return state, log, evaluate(key, env, policy, task, best, LANES).return_
-
-        return advance
-
-    lane_tasks, keys = split(mesh, (lane_tasks, keys))
-    params = replicate(mesh, network.params)
-    state = start(keys, lane_tasks, params)
-    sizes = [eval_every] * (episodes // eval_every)
-    sizes += [episodes % eval_every] if episodes % eval_every else []
-    programs = {
-        size: piece(size).lower(keys, state, lane_tasks, params).compile() for size in set(sizes)
-    }
-    logs, evaluations = [], []
-    cpu = time.process_time()
-    with tqdm(total=episodes * lanes, unit="episode", disable=None) as progress:
-        for number, size in enumerate(sizes):
-            eval_keys = jax.vmap(partial(jax.random.fold_in, data=number))(keys)
-            state, log, returns = programs[size](eval_keys, state, lane_tasks, params)
-            logs.append(jax.device_get(log))
-            evaluations.append(np.asarray(returns))
-            progress.update(size * lanes)
-    cpu = time.process_time() - cpu
-
-    def by_seed(array: np.ndarray) -> np.ndarray:
-        return array[:lanes].reshape(seeds, num, *array.shape[1:])
-
-    log = jax.tree.map(lambda *leaves: by_seed(np.concatenate(leaves, axis=1)), *logs)
-    # The first episode of every search evaluates (g^M) greedily.
-    eval_returns = np.stack([log.returns[:, :, 0], *map(by_seed, evaluations)], axis=-1)
-    eval_episodes = np.concatenate([[1], np.cumsum(sizes)])
-    total = padded * (episodes + len(sizes))
-    return Outcome(log, eval_episodes, eval_returns, total, cpu)
 
 
 def summarize(config: AdaptConfig, outcome: Outcome, optimum: np.ndarray) -> dict[str, Any]:
@@ -290,7 +179,7 @@ def chosen_tasks(env: Environment, path: Path | None) -> Task:
     return load_tasks(released, env) if released.is_file() else benchmark_tasks(env)
 
 
-def chosen_optimizer(config: AdaptConfig) -> Callable[[SearchSpace], Any]:
+def chosen_optimizer(config: AdaptConfig) -> Callable[..., Any]:
     """The optimizer's factory with the hyper-parameters that were given."""
     if config.bandit not in OPTIMIZERS:
         raise nearest(config.bandit, OPTIMIZERS, "optimizer")
@@ -306,7 +195,7 @@ def chosen_optimizer(config: AdaptConfig) -> Callable[[SearchSpace], Any]:
 
 def main(config: AdaptConfig) -> None:
     """Search a prompt for each task within a budget of episodes."""
-    positive(config, "seeds", "episodes", "max_goals", "eval_every")
+    positive(config, "seeds", "episodes", "max_goals", "eval_every", "eval_episodes")
     positive(config.options, "num_edits", "population_size", "latent_dim")
     env = make_env(config.env)
     make_optimizer = chosen_optimizer(config)
@@ -331,6 +220,7 @@ def main(config: AdaptConfig) -> None:
         seed=config.seed,
         max_goals=config.max_goals,
         eval_every=config.eval_every,
+        eval_episodes=config.eval_episodes,
     )
     summary = save_results(folder, config, outcome, tasks, optimum)
     print(table(summary))

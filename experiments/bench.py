@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.base import Environment
-from experiments.adapt import run_adaptation
+from experiments.adaptation import run_adaptation
 from experiments.collect import collect, find_demonstrator
 from experiments.configs import make_env, positive, pretrain_preset
 from experiments.policies import LoadedPolicy, load_network

@@ -45,6 +45,8 @@ class SearchSpace:
     """Budget N; sizes tables, does not stop the search."""
     max_goals: int | Int[Array, ""] | Any = None
     """K, the longest prompt to try; None means ``num_slots``."""
+    deterministic: bool = True
+    """Whether a prompt's greedy episode always has the same return."""
 
     @property
     def longest(self) -> int | Int[Array, ""] | Any:

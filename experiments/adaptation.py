@@ -1,0 +1,225 @@
+"""Many adaptations in one compiled program: every variant, seed and task is a lane of its own.
+
+Lanes are spread over the devices and, on each, run in groups: the lanes of a group share one clock, so
+that a group's episode ends with its slowest lane, and their key-value caches stay small.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import PartitionSpec
+from tqdm import tqdm
+
+from envs.base import Environment, Task
+from experiments.policies import LoadedPolicy
+from experiments.tasks import num_tasks
+from mgpo_jax.adapt import AdaptLog, continue_adaptation, evaluate, start_adaptation
+from mgpo_jax.optimizers import PromptOptimizer, SearchSpace
+from mgpo_jax.policy import Policy, transformer_policy
+from mgpo_jax.prompts import single_goal
+from mgpo_jax.sharding import AXIS, device_mesh, replicate, split
+from mgpo_jax.types import Prompt
+
+LANES = "lanes"
+GROUP = 25  # lanes that share a clock, at most
+NUM_EVAL_EPISODES = 20  # of an evaluation, where starts or worlds are random
+
+
+class Outcome(NamedTuple):
+    """Raw results, axes S seeds, N tasks, E episodes, C evaluations."""
+
+    log: AdaptLog
+    """Leaves [S, N, E, ..]."""
+    eval_episodes: np.ndarray
+    """[C]: after how many episodes the best prompt was evaluated."""
+    eval_returns: np.ndarray
+    """[S, N, C] greedy returns of the best prompt (means of as many episodes as an evaluation has);
+    the first is that of the prompt (g^M)."""
+    num_episodes: int
+    """All episodes that were run, searches and evaluations."""
+    cpu_seconds: float
+    """CPU time of all of them, without compilation."""
+
+
+def run_adaptation(
+    env: Environment,
+    network: LoadedPolicy,
+    make_optimizer: Callable[..., PromptOptimizer],
+    tasks: Task,
+    *,
+    seeds: int,
+    episodes: int,
+    seed: int = 0,
+    max_goals: int | None = None,
+    eval_every: int = 10,
+    eval_episodes: int | None = None,
+) -> Outcome:
+    """Adapt to every task with every seed; ``make_optimizer(space)`` makes the optimizer."""
+    variant = {} if max_goals is None else {"max_goals": max_goals}
+    (outcome,) = run_variants(
+        env,
+        network,
+        make_optimizer,
+        tasks,
+        [variant],
+        seeds=seeds,
+        episodes=episodes,
+        seed=seed,
+        eval_every=eval_every,
+        eval_episodes=eval_episodes,
+    )
+    return outcome
+
+
+def run_variants(
+    env: Environment,
+    network: LoadedPolicy,
+    make_optimizer: Callable[..., PromptOptimizer],
+    tasks: Task,
+    variants: Sequence[Mapping[str, float]],
+    *,
+    seeds: int,
+    episodes: int,
+    seed: int = 0,
+    eval_every: int = 10,
+    eval_episodes: int | None = None,
+) -> list[Outcome]:
+    """One outcome for each variant of the optimizer; all see the same tasks and random keys.
+
+    Args:
+      env: the world.
+      network: the policy.
+      make_optimizer: ``(space, **variant) -> optimizer``.
+      tasks: N tasks, stacked.
+      variants: hyper-parameters by name, the same names in each; ``max_goals`` is that of the search
+        space (K), the others are the optimizer's. They are traced: a sweep compiles once.
+      seeds: independent adaptations to each task.
+      episodes: budget of each.
+      seed: seed of all of them.
+      eval_every: episodes between evaluations of the best prompt.
+      eval_episodes: greedy episodes that an evaluation averages (default: 1 in deterministic worlds,
+        else ``NUM_EVAL_EPISODES``).
+    """
+    num, mesh = num_tasks(tasks), device_mesh()
+    eval_episodes = eval_episodes or (1 if env.spec.deterministic else NUM_EVAL_EPISODES)
+    lanes = len(variants) * seeds * num
+    on_each = -(-lanes // mesh.devices.size)
+    num_groups = -(-on_each // GROUP)
+    group = -(-on_each // num_groups)
+    # Lanes beyond the last variant only fill up the last group.
+    padded = mesh.devices.size * num_groups * group
+    index = np.arange(padded)
+    lane_tasks = jax.tree.map(lambda leaf: jnp.asarray(leaf)[index % num], tasks)
+    keys = jax.random.split(jax.random.key(seed), seeds * num)[index % (seeds * num)]
+    which = index // (seeds * num) % len(variants)
+    hyper = {name: jnp.array([v[name] for v in variants])[which] for name in variants[0]}
+
+    def parts(params: Any, hyper: dict[str, Any]) -> tuple[Policy, PromptOptimizer]:
+        policy = transformer_policy(network.config, params)
+        space = SearchSpace(
+            policy.num_slots,
+            env.sample_goal,
+            env.spec.return_range,
+            episodes,
+            hyper.get("max_goals"),
+            env.spec.deterministic,
+        )
+        options = {name: value for name, value in hyper.items() if name != "max_goals"}
+        return policy, make_optimizer(space, **options)
+
+    def over_lanes(function: Callable) -> Any:
+        """Run for every lane, group by group on each device; the last argument is shared."""
+        spec = PartitionSpec(AXIS)
+
+        def on_device(*args: Any) -> Any:
+            *own, shared = args
+            grouped = jax.tree.map(lambda leaf: leaf.reshape(-1, group, *leaf.shape[1:]), own)
+            together = jax.vmap(lambda own: function(*own, shared), axis_name=LANES)
+            done = jax.lax.map(together, grouped)
+            return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), done)
+
+        def call(*args: Any) -> Any:
+            in_specs = (spec,) * (len(args) - 1) + (PartitionSpec(),)
+            return jax.shard_map(
+                on_device, mesh=mesh, in_specs=in_specs, out_specs=spec, check_vma=False
+            )(*args)
+
+        return jax.jit(call)
+
+    @over_lanes
+    def start(key: Any, task: Task, hyper: Any, params: Any) -> Any:
+        return start_adaptation(key, env, *parts(params, hyper), task)
+
+    def search(num_episodes: int) -> Any:
+        """The next episodes of the search."""
+
+        @over_lanes
+        def advance(state: Any, task: Task, hyper: Any, params: Any) -> Any:
+            policy, optimizer = parts(params, hyper)
+            state, log = continue_adaptation(
+                state, env, policy, optimizer, task, num_episodes, LANES
+            )
+            return state, log, optimizer.best(state.optimizer)
+
+        return advance
+
+    @over_lanes
+    def measure(key: Any, task: Task, prompt: Prompt, params: Any) -> Any:
+        """Mean return of greedy episodes under a prompt, outside of the search."""
+        policy = transformer_policy(network.config, params)
+        returns = jax.lax.map(
+            lambda key: evaluate(key, env, policy, task, prompt, LANES).return_,
+            jax.random.split(key, eval_episodes),
+        )
+        return returns.mean()
+
+    lane_tasks, keys, hyper = split(mesh, (lane_tasks, keys, hyper))
+    params = replicate(mesh, network.params)
+    state = start(keys, lane_tasks, hyper, params)
+    num_slots = network.config.max_prompt_length
+    best = jax.vmap(lambda task: single_goal(env.task_goal(task), num_slots))(lane_tasks)
+    sizes = [eval_every] * (episodes // eval_every)
+    sizes += [episodes % eval_every] if episodes % eval_every else []
+    searches = {
+        size: search(size).lower(state, lane_tasks, hyper, params).compile() for size in set(sizes)
+    }
+    measured = measure.lower(keys, lane_tasks, best, params).compile()
+    logs: list[AdaptLog] = []
+    evaluations = []
+    cpu = time.process_time()
+    with tqdm(total=episodes * lanes, unit="episode", disable=None) as progress:
+        for number, size in enumerate([0, *sizes]):
+            if size:
+                state, log, best = searches[size](state, lane_tasks, hyper, params)
+                logs.append(jax.device_get(log))
+            eval_keys = jax.vmap(partial(jax.random.fold_in, data=number))(keys)
+            evaluations.append(np.asarray(measured(eval_keys, lane_tasks, best, params)))
+            progress.update(size * lanes)
+    cpu = time.process_time() - cpu
+
+    def by_variant(array: np.ndarray) -> np.ndarray:
+        return array[:lanes].reshape(len(variants), seeds, num, *array.shape[1:])
+
+    log = jax.tree.map(lambda *leaves: by_variant(np.concatenate(leaves, axis=1)), *logs)
+    eval_returns = by_variant(np.stack(evaluations, axis=-1))
+    # The search, too, begins with one evaluation of (g^M).
+    after = np.concatenate([[1], np.cumsum(sizes)])
+    share = padded / len(variants)
+    total = round(share * (episodes + len(evaluations) * eval_episodes))
+    return [
+        Outcome(
+            jax.tree.map(lambda leaf, v=v: leaf[v], log),
+            after,
+            eval_returns[v],
+            total,
+            cpu / len(variants),
+        )
+        for v in range(len(variants))
+    ]
