@@ -6,6 +6,8 @@ the machine's own matrix-product rate, measured in the same run between the rows
 
 from __future__ import annotations
 
+import platform
+import resource
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -18,18 +20,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.base import Environment
-from experiments.adaptation import run_adaptation
+from envs.base import Environment, EnvSpec
+from experiments.adaptation import GROUP, LANES, run_adaptation
 from experiments.collect import collect, find_demonstrator
 from experiments.configs import make_env, positive, pretrain_preset
 from experiments.policies import LoadedPolicy, load_network
 from experiments.runtime import Common, provenance, run, write_json
 from experiments.tasks import benchmark_tasks
+from mgpo_jax.adapt import evaluate
 from mgpo_jax.checkpoint import network_config
 from mgpo_jax.dataset import Dataset
 from mgpo_jax.errors import UsageError
 from mgpo_jax.optimizers import ucb
+from mgpo_jax.policy import transformer_policy
 from mgpo_jax.pretrain import batch_stream, make_trainer
+from mgpo_jax.prompts import single_goal
 from mgpo_jax.sharding import device_mesh, largest_divisor
 from mgpo_jax.transformer import TransformerConfig
 
@@ -133,23 +138,97 @@ def bench_gradient_step(env: Environment, dataset: Dataset, num_steps: int) -> I
         "CPU-s",
         f"{size} trajectories, mean {lengths.mean():.1f} steps",
     )
+    yield Row("  real steps", lengths.sum() / cpu, "steps / CPU-s", "padding not counted")
     yield Row("  real tokens", flops / cpu / 1e9, "GFLOP / CPU-s", "padding not counted")
     yield Row("  matrix product", rate, "GFLOP / CPU-s", "2048 x 2048, same run, before and after")
     yield Row("  share of it", 100 * flops / cpu / 1e9 / rate, "%")
     yield Row("  padding", 100 * (1 - lengths.sum() / padded), "%", "of the steps computed")
+    unit = 1e9 if platform.system() == "Darwin" else 1e6  # bytes there, kilobytes elsewhere
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+    yield Row("  peak memory", peak, "GB", "of the whole process so far")
 
 
-def bench_adaptation(env: Environment, num_tasks: int, episodes: int) -> Row:
-    """UCB with the released policy, or with untrained weights where there is none."""
+def policy_to_bench(env: Environment) -> tuple[LoadedPolicy, str]:
+    """The released policy, or untrained weights where there is none."""
     try:
-        network, note = load_network(env, None), "released policy"
+        return load_network(env, None), "released policy"
     except UsageError:
-        config = network_config(env.spec)
-        mesh = device_mesh(1)
+        fast = pretrain_preset(env.spec.name, "fast")
+        config = network_config(env.spec, max_prompt_length=fast.max_prompt_length)
         blank = collect(env, find_demonstrator(env, None)[1], 4, seed=0)[0]
-        train = pretrain_preset(env.spec.name, "fast").train
-        params = make_trainer(train, config, blank, mesh).init().params
-        network, note = LoadedPolicy(config, params, {}), "untrained policy"
+        params = make_trainer(fast.train, config, blank, device_mesh(1)).init().params
+        return LoadedPolicy(config, params, {}), "untrained policy"
+
+
+def bench_decode(env: Environment, network: LoadedPolicy, note: str) -> Iterator[Row]:
+    """Time of one step of acting against the steps before it, and of a whole episode."""
+    horizon, lanes = env.spec.horizon, GROUP
+    policy = transformer_policy(network.config, network.params)
+    keys = jax.random.split(jax.random.key(0), lanes)
+    tasks = jax.vmap(env.sample_task)(keys)
+    prompts = jax.vmap(lambda task: single_goal(env.task_goal(task), policy.num_slots))(tasks)
+    _, first = jax.vmap(env.reset)(keys, tasks)
+    _, carry = jax.jit(jax.vmap(policy.prefill))(prompts, first.obs)
+    action = jnp.zeros(lanes, jnp.int32)
+    if not env.spec.discrete:
+        action = jnp.zeros((lanes, env.spec.action_dim))
+    for position in (horizon // 8, horizon // 2, horizon):
+        room = jax.vmap(lambda cache, n=position - 1: policy.grow(cache, n))(carry)
+
+        @jax.jit
+        def decode(cache: Any, steps: int = min(16, position - 1)) -> Any:
+            def step(cache: Any, _: None) -> tuple[Any, None]:
+                return jax.vmap(policy.decode)(cache, action, first.obs)[1], None
+
+            return jax.lax.scan(step, cache, length=steps)[0].step, steps
+
+        jax.block_until_ready(decode(room))
+        (_, steps), cpu = cpu_time(lambda decode=decode, room=room: decode(room))
+        name = f"decode at {position}"
+        yield Row(
+            name, 1e3 * cpu / lanes / int(steps), "CPU-ms / step", f"{lanes} episodes at once"
+        )
+
+    @jax.jit
+    def episodes(keys: Any) -> Any:
+        run = jax.vmap(
+            lambda key, task, prompt: evaluate(key, Endless(env), policy, task, prompt, LANES),
+            axis_name=LANES,
+        )
+        return run(keys, tasks, prompts).trajectory.length
+
+    jax.block_until_ready(episodes(keys))
+    lengths, cpu = cpu_time(lambda: episodes(keys))
+    mean = float(lengths.mean())
+    yield Row("full episode", cpu / lanes, "CPU-s", f"{note}, all {mean:.0f} steps of the horizon")
+
+
+@dataclass(frozen=True)
+class Endless:
+    """A world whose episodes last to the horizon."""
+
+    env: Environment
+
+    @property
+    def spec(self) -> EnvSpec:
+        return self.env.spec
+
+    def reset(self, key: Any, task: Any) -> Any:
+        (state, timestep) = self.env.reset(key, task)
+        return (jnp.zeros((), jnp.int32), state), timestep
+
+    def step(self, state: Any, action: Any) -> Any:
+        steps, inner = state
+        inner, timestep = self.env.step(inner, action)
+        ends = steps + 1 >= self.spec.horizon
+        ongoing = timestep._replace(terminated=jnp.zeros((), bool), truncated=ends)
+        return (steps + 1, inner), ongoing
+
+
+def bench_adaptation(
+    env: Environment, network: LoadedPolicy, note: str, num_tasks: int, episodes: int
+) -> Row:
+    """UCB on the world's test tasks."""
     tasks = benchmark_tasks(env, num_tasks)
     outcome = run_adaptation(env, network, ucb, tasks, seeds=3, episodes=episodes)
     note = f"{note}, {num_tasks} tasks x 3 seeds x {episodes} episodes"
@@ -172,7 +251,10 @@ def main(config: BenchConfig) -> None:
     show(row)
     for row in bench_gradient_step(env, dataset, 16 if config.quick else 64):
         show(row)
-    show(bench_adaptation(env, 50, 20 if config.quick else 100))
+    network, note = policy_to_bench(env)
+    for row in bench_decode(env, network, note):
+        show(row)
+    show(bench_adaptation(env, network, note, 50, 20 if config.quick else 100))
     if config.json:
         write_json(config.json, {"env": config.env, "rows": rows, **provenance()})
         print(f"rows in {config.json}", file=sys.stderr)

@@ -11,7 +11,7 @@ import pytest
 
 from envs.experts.maze import maze_demonstrators
 from envs.maze_runner import MazeRunner
-from experiments.adapt import run_adaptation
+from experiments.adaptation import run_adaptation
 from experiments.collect import collect
 from experiments.policies import LoadedPolicy
 from experiments.tasks import sample_tasks

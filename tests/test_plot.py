@@ -17,10 +17,12 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
+import envs
 from envs import render
 from envs.maze_runner import NORTH, MazeRunner
 from experiments import figures, plot
 from experiments import results as results_module
+from experiments.figures import base, maze
 from mgpo_jax.distributions import Categorical
 from mgpo_jax.errors import DataError, UsageError
 from mgpo_jax.policy import Policy
@@ -39,6 +41,18 @@ MAZE = np.array(
     ]
 )
 START, GOAL = (5, 3), (1, 5)
+
+
+class Plain(envs.Environment):
+    """A world without pictures."""
+
+    spec = ENV.spec
+
+
+@pytest.fixture(autouse=True)
+def tiny_world(monkeypatch):
+    """The world that the results below name."""
+    monkeypatch.setitem(envs.ENVIRONMENTS, "tiny", lambda: ENV)
 
 
 def north_policy() -> Policy:
@@ -253,7 +267,7 @@ def test_repeated_and_unknown_methods_get_colors_of_their_own():
 def test_final_prompts_of_all_methods_share_a_maze():
     results = {"ucb": fake_results(), "bbt": fake_results("bbt")}
     results["bbt"].best_goals[:, :, -1, -2] = [9.0, 9.0]
-    figure = figures.prompts_on_mazes(results, results["ucb"].tasks, which=(0, 1))
+    figure = maze.prompts_on_mazes(results, results["ucb"].tasks, which=(0, 1))
     assert len(figure.axes) == 2
     discs = discs_of(figure.axes[0])
     assert [disc[:3] for disc in discs[:1]] == [("1", 3, 3)]
@@ -264,16 +278,16 @@ def test_final_prompts_of_all_methods_share_a_maze():
 
 
 def test_visits_are_counted_per_episode(key):
-    task = figures.task_at(fake_results().tasks, 0)
+    task = maze.task_at(fake_results().tasks, 0)
     prompt = fake_results().best_prompt(0, 0)
-    counts = figures.visit_counts(figures.run_policy(key, ENV, NORTHWARD, task, prompt), MAZE)
+    counts = maze.visit_counts(base.run_policy(key, ENV, NORTHWARD, task, prompt), MAZE)
     expected = np.zeros((SIDE, SIDE))
     expected[5:0:-1, 3] = [1, 1, 1, 1, 3]  # four steps up, the last two against the wall
     np.testing.assert_allclose(counts, expected)
 
 
 def test_evolution_shows_the_stages_there_are(key):
-    figure = figures.evolution(ENV, NORTHWARD, fake_results(), 0, stages=(1, 10, 40), key=key)
+    figure = maze.evolution(ENV, NORTHWARD, fake_results(), 0, stages=(1, 10, 40), key=key)
     mazes = [ax for ax in figure.axes if ax.images]
     # 6 steps at -0.1; episode 40 lies beyond the 20 of the results.
     assert [ax.get_title() for ax in mazes] == [
@@ -284,7 +298,7 @@ def test_evolution_shows_the_stages_there_are(key):
 
 
 def test_short_prompts_stand_above_long_ones(key):
-    figure = figures.short_and_long(ENV, NORTHWARD, fake_results().tasks, key)
+    figure = maze.short_and_long(ENV, NORTHWARD, fake_results().tasks, key)
     mazes = [ax for ax in figure.axes if ax.images]
     assert [ax.get_title().split("  ")[0] for ax in mazes] == ["1 goal"] * 2 + ["3 goals"] * 2
     for above, below in zip(mazes[:2], mazes[2:], strict=True):
@@ -391,7 +405,8 @@ def test_an_adaptation_draws_into_its_own_folder(tmp_path):
     assert {path.name for path in folder.glob("*.png")} == {"learning_curve.png", "prompts.png"}
 
 
-def test_worlds_without_mazes_get_curves_only(tmp_path):
+def test_worlds_without_pictures_get_curves_only(tmp_path, monkeypatch):
+    monkeypatch.setitem(envs.ENVIRONMENTS, "tiny", Plain)
     results = fake_results()._replace(tasks={"order": np.zeros((2, 4))})
     run = save_results(tmp_path / "run", results)
     plot.main(plot.PlotConfig(runs=(run,), out=tmp_path / "out"))

@@ -1,0 +1,262 @@
+"""Make an ablation of the paper with one command: ``python -m experiments.reproduce table5``.
+
+Trains what is missing (a stopped run goes on where it was), adapts with UCB, prints the table and draws
+the learning curves. All trainings of a table have the same budget, shorter than that of the released
+policies and named above the table.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import tyro
+
+from experiments.adapt import AdaptConfig, OptimizerConfig, save_results
+from experiments.adaptation import run_variants
+from experiments.configs import RUNS, DataConfig, make_env, positive, pretrain_preset
+from experiments.figures import learning_curve
+from experiments.policies import load_network
+from experiments.pretrain import main as pretrain
+from experiments.results import load_results
+from experiments.runtime import Common, run
+from experiments.table import read_summary
+from experiments.tasks import benchmark_tasks
+from mgpo_jax.errors import UsageError, nearest
+from mgpo_jax.optimizers import ucb
+
+EPISODES = 100  # of an adaptation
+# Gradient steps of each training of a table.
+STEPS = {"maze15": 4_000, "maze30": 2_000}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReproduceConfig(Common):
+    """Settings of ``experiments.reproduce``."""
+
+    what: tyro.conf.Positional[str]
+    """table4 (prompt length and c of UCB), table5 (datasets) or figure8 (longer prompts)."""
+    env: str = "maze15"
+    """The world: maze15 or maze30."""
+    only: tuple[str, ...] = ()
+    """Names of the datasets (table5), or prompt lengths (figure8), to train on (default: all)."""
+    steps: int | None = None
+    """Gradient steps of each training (default: 4,000 for maze15, 2,000 for maze30)."""
+    episodes: int = 10_000
+    """Trajectories of each dataset [10,000]."""
+    seeds: int = 3
+    """Independent adaptations to each test task [3]."""
+    out: Path = RUNS / "reproduce"
+    """Folder of all trainings and results; tables share what they have in common."""
+
+    @property
+    def folder(self) -> Path:
+        return self.out / self.env
+
+    @property
+    def num_steps(self) -> int:
+        return self.steps or STEPS[self.env]
+
+
+class Line(NamedTuple):
+    """One row of a table: its results, and what the paper has for it."""
+
+    label: str
+    results: Path
+    paper: str
+
+
+# Paper, Tables 4 and 5: MGPO-UCB, mean return over 50 test tasks of its own.
+PAPER = {
+    "maze15": {
+        "K = 1": "-2.63 ± 0.00",
+        "K = 2": "-1.13 ± 0.10",
+        "K = 3": "-0.77 ± 0.04",
+        "K = 5": "-0.41 ± 0.10",
+        "c = 0": "-0.44 ± 0.07",
+        "c = 1": "-0.41 ± 0.10",
+        "c = 10": "-0.40 ± 0.04",
+        "random": "-1.05 ± 0.01",
+        "astar1": "-0.97 ± 0.03",
+        "astar2": "-0.36 ± 0.02",
+        "astar4": "-0.41 ± 0.10",
+    },
+    "maze30": {
+        "K = 1": "-27.06 ± 0.00",
+        "K = 2": "-19.57 ± 1.21",
+        "K = 3": "-17.12 ± 0.47",
+        "K = 5": "-14.21 ± 0.19",
+        "c = 0": "-15.86 ± 0.51",
+        "c = 1": "-14.21 ± 0.19",
+        "c = 10": "-14.70 ± 0.66",
+        "random": "-17.13 ± 0.52",
+        "astar1": "-9.26 ± 0.38",
+        "astar2": "-8.66 ± 0.35",
+        "astar4": "-14.21 ± 0.19",
+    },
+}
+
+
+def trained(config: ReproduceConfig, dataset: str, max_prompt_length: int) -> Path:
+    """The policy of one training, which is run or continued if it is not finished."""
+    name = f"{dataset}-k{max_prompt_length}-{config.num_steps}steps-{config.episodes}episodes"
+    folder = config.folder / "policies" / name
+    if not (folder / "policy").is_dir():
+        print(f"training {folder}", file=sys.stderr)
+        fast = pretrain_preset(config.env, "fast")
+        pretrain(
+            replace(
+                fast,
+                data=DataConfig(demonstrator=dataset, episodes=config.episodes),
+                train=replace(fast.train, steps=config.num_steps),
+                max_prompt_length=max_prompt_length,
+                out=folder,
+                resume=folder.exists(),
+            )
+        )
+    return folder / "policy"
+
+
+def adapted(
+    config: ReproduceConfig,
+    policy: Path | None,
+    folders: Mapping[Path, Mapping[str, Any]],
+    scale: float | None = None,
+) -> None:
+    """UCB with each variant of its settings, as one program; finished results stay as they are.
+
+    Args:
+      config: settings of the command.
+      policy: folder of the policy; None for the released one.
+      folders: result folders to write, with the variant (``c``, ``max_goals``) of each.
+      scale: of ``ucb``.
+    """
+    if all((folder / "summary.json").is_file() for folder in folders):
+        return
+    env = make_env(config.env)
+    tasks = benchmark_tasks(env)
+    print(f"adapting with {policy or 'the released policy'}", file=sys.stderr)
+    outcomes = run_variants(
+        env,
+        load_network(env, policy),
+        partial(ucb, scale=scale),
+        tasks,
+        list(folders.values()),
+        seeds=config.seeds,
+        episodes=EPISODES,
+    )
+    optimum = np.asarray(jax.jit(jax.vmap(env.optimal_return))(tasks))
+    for (folder, variant), outcome in zip(folders.items(), outcomes, strict=True):
+        if folder.exists():
+            continue
+        adapt = AdaptConfig(
+            env=config.env,
+            policy=policy,
+            seeds=config.seeds,
+            episodes=EPISODES,
+            max_goals=variant.get("max_goals"),
+            out=folder,
+            options=OptimizerConfig(c=variant.get("c"), scale=scale),
+        )
+        save_results(folder, adapt, outcome, tasks, optimum)
+
+
+def table4(config: ReproduceConfig) -> list[Line]:
+    """Longest prompt K and exploration constant c, with the released policy (Table 4)."""
+    folder, paper = config.folder / "table4", PAPER[config.env]
+    lengths = {folder / f"K{k}-{config.seeds}seeds": {"max_goals": k} for k in (1, 2, 3, 5)}
+    constants = {folder / f"c{c}-{config.seeds}seeds": {"c": float(c)} for c in (0, 1, 10)}
+    adapted(config, None, lengths)
+    adapted(config, None, constants, scale=1.0)  # Eq. 3 as printed
+    lines = [(f"K = {variant['max_goals']}", path) for path, variant in lengths.items()]
+    lines += [(f"c = {variant['c']:.0f}", path) for path, variant in constants.items()]
+    return [Line(label, path, paper[label]) for label, path in lines]
+
+
+def table5(config: ReproduceConfig) -> list[Line]:
+    """One policy for each dataset (Table 5)."""
+    lines = []
+    for dataset in chosen(config, ("random", "astar1", "astar2", "astar4")):
+        policy = trained(config, dataset, max_prompt_length=5)
+        results = config.folder / "table5" / f"{policy.parent.name}-{config.seeds}seeds"
+        adapted(config, policy, {results: {}})
+        lines.append(Line(dataset, results, PAPER[config.env][dataset]))
+    return lines
+
+
+def figure8(config: ReproduceConfig) -> list[Line]:
+    """One policy for each longest prompt K (Figure 8)."""
+    lines = []
+    for length in chosen(config, ("5", "10", "20", "40")):
+        policy = trained(config, "astar4", max_prompt_length=int(length))
+        results = config.folder / "figure8" / f"{policy.parent.name}-{config.seeds}seeds"
+        adapted(config, policy, {results: {}})
+        lines.append(Line(f"K = {length}", results, ""))
+    return lines
+
+
+ABLATIONS: dict[str, Callable[[ReproduceConfig], list[Line]]] = {
+    "table4": table4,
+    "table5": table5,
+    "figure8": figure8,
+}
+
+
+def chosen(config: ReproduceConfig, names: Sequence[str]) -> Sequence[str]:
+    """Those of ``names`` that ``--only`` leaves."""
+    for name in config.only:
+        if name not in names:
+            raise nearest(name, names, f"row of {config.what}")
+    return config.only or names
+
+
+def markdown(lines: Sequence[Line]) -> str:
+    """The table, one row for each line."""
+    head = ["", "initial", "final (mean ± std over seeds)", "regret", "after 40", "paper: final"]
+    rows = [head, ["---"] * len(head)]
+    for line in lines:
+        summary = read_summary(line.results)
+        after_40 = summary["regret_after_40"]
+        rows.append(
+            [
+                line.label,
+                f"{summary['initial_return']:.2f}",
+                f"{summary['final_return']:.3f} ± {summary['final_return_std_over_seeds']:.3f}",
+                f"{summary['regret']:.3f}",
+                "" if after_40 is None else f"{after_40:.3f}",
+                line.paper,
+            ]
+        )
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def main(config: ReproduceConfig) -> None:
+    """Reproduce an ablation of the paper: train, adapt, print the table, draw the curves."""
+    positive(config, "steps", "episodes", "seeds")
+    if config.what not in ABLATIONS:
+        raise nearest(config.what, ABLATIONS, "ablation")
+    if config.env not in PAPER:
+        raise UsageError(f"the paper has no {config.what} for {config.env}; it has {list(PAPER)}")
+    lines = ABLATIONS[config.what](config)
+    budget = (
+        ""
+        if config.what == "table4"
+        else (f", {config.num_steps:,} gradient steps on {config.episodes:,} trajectories each")
+    )
+    text = f"{config.env}, UCB, {config.seeds} seeds{budget}\n\n{markdown(lines)}\n"
+    print(text)
+    results = {line.label: load_results(line.results) for line in lines}
+    place = config.folder / f"{config.what}.md"
+    place.write_text(text)
+    learning_curve(results, config.env).savefig(place.with_suffix(".png"))
+    print(f"table and curves in {place} and .png", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    run(ReproduceConfig, main)

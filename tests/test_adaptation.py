@@ -1,0 +1,115 @@
+"""Many adaptations at once: variants and groups change nothing but speed, evaluations are averages."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mgpo_jax.rollout
+from envs.grid_world import GridWorld
+from envs.maze_runner import MazeRunner
+from experiments import adaptation
+from experiments.adaptation import run_adaptation, run_variants
+from experiments.policies import LoadedPolicy
+from experiments.tasks import sample_tasks
+from mgpo_jax.checkpoint import network_config
+from mgpo_jax.optimizers import ucb
+from mgpo_jax.transformer import GoalTransformer
+from mgpo_jax.types import Prompt
+
+MAZE = MazeRunner(name="tiny", side=7, horizon=10)
+GRID = GridWorld(name="tiny", horizon=10)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_segments():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mgpo_jax.rollout, "NUM_SEGMENTS", 1)
+        yield
+
+
+def untrained(env):
+    """A policy with weights large enough to act differently under different prompts."""
+    spec = env.spec
+    config = network_config(
+        spec, max_prompt_length=3, embed_dim=8, num_layers=1, num_heads=1, dropout=0.0
+    )
+    prompt = Prompt(jnp.zeros((3, spec.goal_dim)), jnp.ones(3, bool))
+    inputs = (prompt, jnp.zeros((2, spec.obs_dim)), jnp.zeros(2, jnp.int32))
+    shapes = jax.eval_shape(GoalTransformer(config).init, jax.random.key(0), *inputs)
+    rng = np.random.default_rng(1)
+    params = jax.tree.map(
+        lambda leaf: jnp.asarray(0.5 * rng.standard_normal(leaf.shape), leaf.dtype), shapes
+    )
+    return LoadedPolicy(config, params, {})
+
+
+@pytest.fixture(scope="module")
+def maze_run():
+    run = partial(run_variants, seeds=2, episodes=6, eval_every=4)
+    return partial(run, MAZE, untrained(MAZE), ucb, sample_tasks(MAZE, 5, 3))
+
+
+VARIANTS = [{"c": 0.0, "max_goals": 1}, {"c": 10.0, "max_goals": 3}]
+
+
+@pytest.fixture(scope="module")
+def sweep(maze_run):
+    return maze_run(VARIANTS)
+
+
+def assert_same(a, b):
+    """Equal but for rounding and for what depends on speed."""
+    a, b = a._replace(cpu_seconds=0.0), b._replace(cpu_seconds=0.0)
+    jax.tree.map(partial(np.testing.assert_allclose, atol=1e-5), a, b)
+
+
+def test_a_sweep_equals_single_runs(maze_run, sweep):
+    for variant, outcome in zip(VARIANTS, sweep, strict=True):
+        assert_same(maze_run([variant])[0], outcome)
+
+
+def test_variants_differ(sweep):
+    goals = [outcome.log.prompts.mask.sum(axis=-1).max() for outcome in sweep]
+    assert goals[0] == 1
+    assert goals[1] > 1
+
+
+def test_groups_do_not_matter(maze_run, sweep, monkeypatch):
+    """Not even when lanes have to be made up to fill the last group."""
+    monkeypatch.setattr(adaptation, "GROUP", 4)
+    for small, outcome in zip(maze_run(VARIANTS), sweep, strict=True):
+        assert small.num_episodes >= outcome.num_episodes
+        assert_same(small._replace(num_episodes=outcome.num_episodes), outcome)
+
+
+def test_a_run_is_a_sweep_of_one(sweep):
+    outcome = run_adaptation(
+        MAZE, untrained(MAZE), partial(ucb, c=10.0), sample_tasks(MAZE, 5, 3),
+        seeds=2, episodes=6, max_goals=3, eval_every=4,
+    )  # fmt: skip
+    assert_same(outcome, sweep[1])
+
+
+def test_evaluations_stand_beside_the_search(sweep):
+    outcome = sweep[1]
+    np.testing.assert_array_equal(outcome.eval_episodes, [1, 4, 6])
+    assert outcome.eval_returns.shape == (2, 3, 3)
+    # In a world without chance the search's own first episode is the first evaluation.
+    np.testing.assert_allclose(outcome.log.returns[:, :, 0], outcome.eval_returns[:, :, 0])
+    assert outcome.num_episodes == 2 * 3 * (6 + 3)
+
+
+def test_chance_is_averaged_out():
+    """Each evaluation in a world of random starts is the mean of many episodes."""
+    run = partial(
+        run_adaptation, GRID, untrained(GRID), ucb, sample_tasks(GRID, 5, 2), seeds=2, episodes=2
+    )
+    many = run()
+    assert many.num_episodes == 2 * 2 * (2 + 2 * adaptation.NUM_EVAL_EPISODES)
+    assert run(eval_episodes=3).num_episodes == 2 * 2 * (2 + 2 * 3)
+    assert np.isfinite(many.eval_returns).all()
