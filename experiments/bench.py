@@ -189,10 +189,12 @@ def bench_decode(env: Environment, network: LoadedPolicy, note: str) -> Iterator
             name, 1e3 * cpu / lanes / int(steps), "CPU-ms / step", f"{lanes} episodes at once"
         )
 
+    endless: Any = Endless(env)
+
     @jax.jit
     def episodes(keys: Any) -> Any:
         run = jax.vmap(
-            lambda key, task, prompt: evaluate(key, Endless(env), policy, task, prompt, LANES),
+            lambda key, task, prompt: evaluate(key, endless, policy, task, prompt, LANES),
             axis_name=LANES,
         )
         return run(keys, tasks, prompts).trajectory.length

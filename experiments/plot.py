@@ -7,28 +7,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import jax
 import matplotlib as mpl
 import numpy as np
 import tyro
-from matplotlib.figure import Figure
 
-from envs.render import maze_gif
-from experiments.figures import (
-    STYLE,
-    evolution,
-    goals_of,
-    learning_curve,
-    positions_of,
-    prompts_on_mazes,
-    run_policy,
-    short_and_long,
-    start_of,
-    task_at,
-)
+from experiments.configs import make_env
+from experiments.figures import STYLE, learning_curve, pictures
+from experiments.figures.base import Save
 from experiments.results import Results, load_results
 from experiments.runtime import Common, run
 from mgpo_jax.errors import UsageError
+from mgpo_jax.policy import Policy
 
 
 @dataclass(frozen=True)
@@ -40,9 +29,9 @@ class PlotConfig(Common):
     out: Path = Path("figures")
     """Folder to write."""
     tasks: tuple[int, ...] = ()
-    """Tasks to draw on mazes, counted from 0 (default: the four that the first run improved most)."""
+    """Tasks to draw, counted from 0 (default: the four that the first run improved most)."""
     seed: int = 0
-    """Which seed of the adaptations to draw on mazes, counted from 0."""
+    """Which seed of the adaptations to draw, counted from 0."""
 
 
 def main(config: PlotConfig) -> None:
@@ -59,19 +48,22 @@ def main(config: PlotConfig) -> None:
     config.out.mkdir(parents=True, exist_ok=True)
     for env_name, folders in by_env.items():
         results = label_runs(folders)
-        _save(learning_curve(results, env_name), config.out / f"{env_name}_learning_curve.png")
-        if "maze" in next(iter(results.values())).tasks:
-            _draw_mazes(config, env_name, results)
+        curve = learning_curve(results, env_name)
+        _save(curve.savefig, config.out / f"{env_name}_learning_curve.png")
+        which = config.tasks or next(iter(results.values())).most_improved()
+        drawn = pictures(make_env(env_name)).draw_all(results, _load, which, config.seed)
+        for name, save in drawn:
+            _save(save, config.out / f"{env_name}_{name}")
 
 
 def draw_run(folder: Path) -> None:
     """Draw into the folder of one adaptation what needs no policy."""
     result = load_results(folder)
-    results = {result.config["bandit"]: result}
-    _save(learning_curve(results, result.config["env"]), folder / "learning_curve.png")
-    if "maze" in result.tasks:
-        which = result.most_improved()
-        _save(prompts_on_mazes(results, result.tasks, which), folder / "prompts.png")
+    env_name = result.config["env"]
+    curve = learning_curve({result.config["bandit"]: result}, env_name)
+    _save(curve.savefig, folder / "learning_curve.png")
+    for name, save in pictures(make_env(env_name)).draw_run(result, result.most_improved()):
+        _save(save, folder / name)
 
 
 def label_runs(folders: Mapping[Path, Results]) -> dict[str, Results]:
@@ -97,46 +89,22 @@ def _check_together(config: PlotConfig, folders: Mapping[Path, Results]) -> None
             )
         if not 0 <= config.seed < len(result.returns):
             raise UsageError(f"--seed {config.seed}: {folder} has {len(result.returns)} seeds")
+    num = len(first.optimal_returns)
+    if not all(0 <= index < num for index in config.tasks):
+        raise UsageError(f"--tasks: {first.config['env']} has the tasks 0 to {num - 1}")
 
 
-def _draw_mazes(config: PlotConfig, env_name: str, results: Mapping[str, Results]) -> None:
-    """Figures 2, 3, 9 and 10, and a GIF of the first task under the optimized prompt."""
+def _load(result: Results) -> Policy:
     from experiments.policies import load_policy
 
-    out, seed = config.out, config.seed
-    first = next(iter(results.values()))
-    tasks, which = first.tasks, list(config.tasks) or first.most_improved()
-    if not all(0 <= index < len(tasks["maze"]) for index in which):
-        raise UsageError(f"--tasks: {env_name} has the tasks 0 to {len(tasks['maze']) - 1}")
-    _save(prompts_on_mazes(results, tasks, which, seed), out / f"{env_name}_prompts.png")
-
-    chosen = {name: array[which] for name, array in tasks.items()}
-    key = jax.random.key(seed)
-    drawn: set[str] = set()
-    for number, result in enumerate(results.values()):
-        path = result.config.get("policy")
-        env, policy = load_policy(env_name, path and Path(path))
-        method = result.config["bandit"]
-        name = f"{env_name}_{method}" + (f"_{number}" if method in drawn else "")
-        if not drawn:
-            _save(short_and_long(env, policy, chosen, key), out / f"{env_name}_short_and_long.png")
-        drawn.add(method)
-        for task in which:
-            figure = evolution(env, policy, result, task, seed, key=key)
-            _save(figure, out / f"{name}_evolution_task{task}.png")
-
-        task, maze = which[0], tasks["maze"][which[0]]
-        prompt = result.best_prompt(seed, task)
-        episode = run_policy(key, env, policy, task_at(tasks, task), prompt, greedy=True)
-        walk = positions_of(episode, len(maze))[0]
-        gif = out / f"{name}_episode_task{task}.gif"
-        maze_gif(gif, maze, start_of(maze), tasks["goal"][task], walk, goals_of(prompt))
-        print(gif, file=sys.stderr)
+    path = result.config.get("policy")
+    _, policy = load_policy(result.config["env"], path and Path(path))
+    return policy
 
 
-def _save(figure: Figure, path: Path) -> None:
+def _save(save: Save, path: Path) -> None:
     with mpl.rc_context(STYLE):
-        figure.savefig(path)
+        save(path)
     print(path, file=sys.stderr)
 
 

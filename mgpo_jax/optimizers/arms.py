@@ -24,6 +24,7 @@ from mgpo_jax.prompts import sample_prompt, single_goal
 from mgpo_jax.types import Episode, PRNGKeyArray, Prompt, Query, Trajectory
 
 MAX_ARMS = 64
+SHRINKAGE = 2.0
 
 
 class Arms(NamedTuple):
@@ -71,6 +72,21 @@ def insert_arm(arms: Arms, prompt: Prompt, return_: Float[Array, ""]) -> Arms:
         greedy_return=arms.greedy_return.at[row].set(return_),
         size=jnp.minimum(arms.size + 1, len(arms.pulls)),
     )
+
+
+def estimated_returns(arms: Arms, deterministic: bool) -> Float[Array, "M"]:
+    """What each prompt is expected to return when it acts greedily; -inf for free rows.
+
+    In a deterministic world the one greedy evaluation is the answer. Elsewhere it is a draw, and the
+    best of many draws is mostly luck (the authors' code reports it): there the estimate is the mean of
+    all returns of the arm, shrunk towards the mean of the table as by ``SHRINKAGE`` more episodes
+    of that return.
+    """
+    if deterministic:
+        return arms.greedy_return
+    overall = jnp.sum(arms.pulls * arms.mean) / jnp.maximum(jnp.sum(arms.pulls), 1)
+    shrunk = (arms.pulls * arms.mean + SHRINKAGE * overall) / (arms.pulls + SHRINKAGE)
+    return jnp.where(arms.taken, shrunk, -jnp.inf)
 
 
 def update_arm(arms: Arms, arm: Int[Array, ""], return_: Float[Array, ""]) -> Arms:
@@ -148,6 +164,6 @@ def bandit(space: SearchSpace, select: Select, act_with_newest: bool = False) ->
         )
 
     def best(state: BanditState) -> Prompt:
-        return state.arms.prompt(jnp.argmax(state.arms.greedy_return))
+        return state.arms.prompt(jnp.argmax(estimated_returns(state.arms, space.deterministic)))
 
     return PromptOptimizer(init, ask, tell, best)

@@ -1,20 +1,16 @@
-"""The figures, as functions of results and policies.
+"""Figures of mazes, numbered as in the paper.
 
-Numbered as in the paper: 6 and 7 learning curves, 2 prompts on mazes, 3 and 10 how prompt and behavior
-evolve, 9 short and long prompts.
+2 prompts on mazes, 3 and 10 how prompt and behavior evolve, 9 short and long prompts.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial, wraps
-from pathlib import Path
-from typing import Any, ParamSpec
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-import matplotlib as mpl
 import numpy as np
 from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
@@ -22,130 +18,71 @@ from matplotlib.lines import Line2D
 
 from envs.base import Environment
 from envs.maze_runner import MazeRunner, MazeTask
-from envs.render import INK, PROMPT_COLOR, bar_lanes, draw_maze, visit_norm, visit_scale
+from envs.render import PROMPT_COLOR, bar_lanes, draw_maze, maze_gif, visit_norm, visit_scale
+from experiments.figures.base import (
+    STAGES,
+    LoadPolicy,
+    Pictures,
+    Save,
+    file_names,
+    goals_of,
+    run_policy,
+)
+from experiments.figures.style import method_styles, styled
 from experiments.results import Results
-from mgpo_jax.errors import DataError
 from mgpo_jax.policy import Policy
 from mgpo_jax.prompts import sample_prompt, single_goal
-from mgpo_jax.rollout import rollout
-from mgpo_jax.types import Episode, Prompt, Query
+from mgpo_jax.types import Episode, Prompt
 
-NUM_ROLLOUTS = 64
-STAGES = (1, 10, 20, 40, 100)
 PANEL = 1.9  # inches of one maze
 
-STYLE: dict[Any, Any] = {
-    "figure.dpi": 150,
-    "savefig.dpi": 150,
-    "font.family": "DejaVu Sans",
-    "font.size": 8,
-    "axes.titlesize": 8,
-    "legend.fontsize": 7.5,
-    "legend.frameon": False,
-    "text.color": INK,
-    "axes.labelcolor": INK,
-    "axes.edgecolor": "#7A868C",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#E6E9EB",
-    "xtick.color": "#7A868C",
-    "ytick.color": "#7A868C",
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "lines.markersize": 4,
-}
 
-# Method -> (name in legends, color, line style, marker).
-METHODS = {
-    "ucb": ("MGPO-UCB", "#D55E00", "-", "o"),
-    "bpe": ("MGPO-BPE", "#0072B2", "-", "s"),
-    "explore": ("MGPO-explore", "#009E73", "-", "^"),
-    "grips": ("GRIPS", "#CC79A7", "--", "D"),
-    "bbt": ("BBT", "#56B4E9", "--", "v"),
-}
-SPARE_COLORS = ("#E69F00", "#6B6B6B", "#8C510A", "#5E3C99", "#B2182B", "#003C30")
+def maze_pictures(env: MazeRunner) -> Pictures:
+    """Figures 2, 3, 9 and 10, and a GIF of the first task under the optimized prompt."""
+    return Pictures(draw_run, partial(draw_all, env))
 
 
-Args = ParamSpec("Args")
+def draw_run(result: Results, which: Sequence[int]) -> Iterator[tuple[str, Save]]:
+    """The figure that needs no policy."""
+    results = {result.config["bandit"]: result}
+    yield "prompts.png", prompts_on_mazes(results, result.tasks, which).savefig
 
 
-def styled(draw: Callable[Args, Figure]) -> Callable[Args, Figure]:
-    """Draw in ``STYLE`` without touching the settings of the process."""
+def draw_all(
+    env: MazeRunner,
+    results: Mapping[str, Results],
+    load: LoadPolicy,
+    which: Sequence[int],
+    seed: int,
+) -> Iterator[tuple[str, Save]]:
+    """All figures of some adaptations."""
+    tasks = next(iter(results.values())).tasks
+    yield "prompts.png", prompts_on_mazes(results, tasks, which, seed).savefig
 
-    @wraps(draw)
-    def wrapper(*args: Args.args, **kwargs: Args.kwargs) -> Figure:
-        with mpl.rc_context(STYLE):
-            return draw(*args, **kwargs)
-
-    return wrapper
-
-
-def method_styles(labels: Iterable[str]) -> dict[str, tuple[str, str, Any, str]]:
-    """(legend, color, line style, marker) of each label, a method's name or "name (remark)"."""
-    styles: dict[str, tuple[str, str, Any, str]] = {}
-    taken: set[str] = set()
-    spare = iter(SPARE_COLORS * 10)
-    for label in labels:
-        method, _, remark = label.partition(" ")
-        name, color, line, marker = METHODS.get(method, (method, "", "-", "o"))
-        color = next(spare) if color in taken or not color else color
-        taken.add(color)
-        styles[label] = (f"{name} {remark}".strip(), color, line, marker)
-    return styles
-
-
-@styled
-def learning_curve(results: Mapping[str, Results], title: str | None = None) -> Figure:
-    """Figures 6 and 7: return of the optimized prompt over the episodes of adaptation.
-
-    Lines are means over tasks and seeds, bands the standard deviation over seeds.
-    """
-    figure = Figure(figsize=(3.6, 2.7), layout="constrained")
-    ax = figure.add_subplot()
-    for label, (name, color, line, marker) in method_styles(results).items():
-        result = results[label]
-        by_seed = result.eval_returns.mean(axis=1)
-        mean, std = by_seed.mean(axis=0), by_seed.std(axis=0)
-        episodes = result.eval_episodes
-        ax.plot(
-            episodes, mean, label=name, color=color, linestyle=line, marker=marker,
-            markeredgecolor="white", markeredgewidth=0.6,
-        )  # fmt: skip
-        if len(by_seed) > 1:
-            ax.fill_between(episodes, mean - std, mean + std, color=color, alpha=0.16, linewidth=0)
-    optima = {round(float(result.optimal_returns.mean()), 6) for result in results.values()}
-    for index, optimum in enumerate(sorted(optima)):
-        label = "_" if index else "optimum"
-        ax.axhline(optimum, color=INK, linestyle=(0, (4, 3)), linewidth=1.0, label=label, zorder=1)
-    ax.set(xlabel="episodes", ylabel="return of the optimized prompt", title=title or "")
-    ax.set_xlim(left=0)
-    ax.margins(y=0.08)
-    ax.legend(loc="best")
-    return figure
+    chosen = {name: array[list(which)] for name, array in tasks.items()}
+    key = jax.random.key(seed)
+    for number, (name, result) in enumerate(file_names(results.values()).items()):
+        policy = load(result)
+        if number == 0:
+            yield "short_and_long.png", short_and_long(env, policy, chosen, key).savefig
+        for task in which:
+            figure = evolution(env, policy, result, task, seed, key=key)
+            yield f"{name}_evolution_task{task}.png", figure.savefig
+        yield (
+            f"{name}_episode_task{which[0]}.gif",
+            episode(env, policy, result, which[0], seed, key),
+        )
 
 
-@styled
-def training_curve(metrics: Path) -> Figure:
-    """Losses of a pre-training run and its greedy returns on the way, from ``metrics.jsonl``."""
-    try:
-        rows = [json.loads(line) for line in metrics.read_text().splitlines()]
-        steps = [row["step"] for row in rows]
-    except (OSError, ValueError, TypeError, KeyError):
-        raise DataError(f"{metrics} is missing or not readable JSON lines") from None
-    figure = Figure(figsize=(6.4, 2.4), layout="constrained")
-    panels = (
-        ("loss", {"train/loss": "training", "val/loss": "held out"}),
-        ("return of the initial prompt", {"eval/initial_return": "_"}),
-    )
-    colors = (METHODS["bpe"][1], METHODS["ucb"][1])
-    for ax, (ylabel, names) in zip(figure.subplots(1, 2), panels, strict=True):
-        for (name, label), color in zip(names.items(), colors, strict=False):
-            values = [row.get(name, np.nan) for row in rows]
-            ax.plot(steps, values, color=color, label=label, marker="o", markersize=3)
-        ax.set(xlabel="steps", ylabel=ylabel)
-    figure.axes[0].legend()
-    return figure
+def episode(
+    env: MazeRunner, policy: Policy, results: Results, task: int, seed: int, key: jax.Array
+) -> Save:
+    """A GIF of one greedy episode under the optimized prompt."""
+    maze, goal = results.tasks["maze"][task], results.tasks["goal"][task]
+    prompt = results.best_prompt(seed, task)
+    episodes = run_policy(key, env, policy, task_at(results.tasks, task), prompt, greedy=True)
+    walk = positions_of(episodes, len(maze))[0]
+    return lambda path: maze_gif(path, maze, start_of(maze), goal, walk, goals_of(prompt))
 
 
 @styled
@@ -239,21 +176,6 @@ def short_and_long(
     return figure
 
 
-@partial(jax.jit, static_argnames=("env", "policy"))
-def run_policy(
-    key: jax.Array,
-    env: Environment,
-    policy: Policy,
-    task: Any,
-    prompt: Prompt,
-    greedy: bool | jax.Array = False,
-) -> Episode:
-    """``NUM_ROLLOUTS`` episodes under one prompt."""
-    query = Query(prompt, jnp.asarray(greedy))
-    episode = jax.vmap(lambda k: rollout(k, env, policy, task, query, "lanes"), axis_name="lanes")
-    return episode(jax.random.split(key, NUM_ROLLOUTS))
-
-
 def positions_of(episode: Episode, side: int) -> list[np.ndarray]:
     """The cells after each step, ``[length, 2]`` for each of a batch of maze episodes."""
     cells = np.rint(np.asarray(episode.trajectory.goals) * side).astype(int)
@@ -268,11 +190,6 @@ def visit_counts(episode: Episode, maze: np.ndarray) -> np.ndarray:
     counts = np.zeros(maze.shape)
     np.add.at(counts, tuple(cells.T), 1.0)
     return counts / len(walks)
-
-
-def goals_of(prompt: Prompt) -> np.ndarray:
-    """The goals of one prompt, ``[k, G]``."""
-    return np.asarray(prompt.goals)[np.asarray(prompt.mask)]
 
 
 def start_of(maze: np.ndarray) -> tuple[int, int]:

@@ -1,7 +1,7 @@
-"""Host-side pictures of mazes: walls, visits, paths, prompts, and GIFs of episodes.
+"""Pictures of mazes: walls, visits, paths, prompts, and GIFs of episodes.
 
 Positions are (row, column). Markers and labels are drawn in units of cells, so they keep their place
-and proportion at every figure size. Colors are the color-blind-safe palette of Okabe and Ito.
+and proportion at every figure size.
 """
 
 from __future__ import annotations
@@ -10,37 +10,37 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-import imageio.v3 as iio
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, PowerNorm, to_rgb
 from matplotlib.figure import Figure
-from matplotlib.font_manager import FontProperties
-from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, FancyBboxPatch, Patch, PathPatch, Rectangle
-from matplotlib.textpath import TextPath
-from matplotlib.transforms import Affine2D
+from matplotlib.patches import Circle, Rectangle
+
+from envs.render.marks import draw_box, draw_disc, draw_leader, spread_apart
+from envs.render.palette import (
+    BAR_COLOR,
+    BLUE,
+    FREE_COLOR,
+    PAPER,
+    VERMILION,
+    WALL_COLOR,
+    YELLOW,
+)
+from envs.render.video import write_gif
 
 Cell = tuple[int, int] | np.ndarray  # row, column
 
-PROMPT_COLOR = "#D55E00"
-AGENT_COLOR = "#0072B2"
-START_COLOR = "#FFFFFF"
-GOAL_COLOR = "#F0E442"
-INK = "#1F292E"
-WALL_COLOR = "#3D4A52"
-FREE_COLOR = "#FAFAFC"
-BAR_COLOR = "#C9CED2"
+PROMPT_COLOR = VERMILION
+AGENT_COLOR = BLUE
+START_COLOR = PAPER
+GOAL_COLOR = YELLOW
 VISIT_COLORS = LinearSegmentedColormap.from_list(
     "visits", ["#EAE6F3", "#C3B7DC", "#9A86C2", "#704FA3", "#48237F", "#260B4D"]
 )
 
 BAR_GAP = 0.6  # cells between the maze and the bar of goals outside of it
 BAR_LANE, BAR_ROW = 1.7, 1.35  # size of a marker's place in that bar, in marker units
-FONT = FontProperties(family="DejaVu Sans", weight="bold")
-MAX_FRAMES = 120
 
 
 class Placement(NamedTuple):
@@ -148,23 +148,18 @@ def maze_gif(
     prompts = _by_color(prompt_goals)
     width = picture_width(side, bar_lanes(side, prompts.values())) / side
     figure = Figure(figsize=(3.0 * width, 3.0), dpi=100)
-    canvas = FigureCanvasAgg(figure)
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     draw_maze(ax, maze, start, goal, prompts)
     (trail,) = ax.plot([], [], color=AGENT_COLOR, alpha=0.6, linewidth=2.5, zorder=1.5)
     agent = Circle((0, 0), 0.36 * _unit(side), facecolor=AGENT_COLOR, edgecolor="white", zorder=9)
     ax.add_patch(agent)
 
-    frames = []
-    times = np.unique(np.linspace(0, len(walk) - 1, min(len(walk), MAX_FRAMES)).round().astype(int))
-    for time in times:
+    def show(time: int) -> None:
         rows, columns = walk[: time + 1].T
         trail.set_data(columns, rows)
         agent.center = (columns[-1], rows[-1])
-        canvas.draw()
-        frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
-    durations = [100] * (len(frames) - 1) + [1500]  # ms; the end stays on view
-    iio.imwrite(path, np.stack(frames), extension=".gif", duration=durations, loop=0)
+
+    write_gif(path, figure, show, len(walk))
 
 
 def _by_color(prompts: np.ndarray | Mapping[str, np.ndarray] | None) -> Mapping[str, np.ndarray]:
@@ -223,10 +218,7 @@ def _draw_markers(ax: Axes, side: int, markers: list[_Marker], lanes: int) -> No
     centers = spread_apart(homes, heavy, gap=unit, limits=(margin, side - 1 - margin))
     for marker, home, center in zip(inside, homes, centers, strict=True):
         if np.linalg.norm(center - home) > 0.5:
-            ends = np.stack([home, center])
-            line = Line2D(ends[:, 1], ends[:, 0], color=INK, linewidth=0.8, zorder=2.5)
-            line.set(marker="o", markersize=2.5, markevery=[0])
-            ax.add_line(line)
+            draw_leader(ax, home, center)
         _draw_marker(ax, marker, center[1], center[0], unit)
 
     if lanes:
@@ -239,52 +231,6 @@ def _draw_markers(ax: Axes, side: int, markers: list[_Marker], lanes: int) -> No
             _draw_marker(ax, marker, x, -0.5 + (row + 0.6) * BAR_ROW * unit, unit)
 
 
-def spread_apart(
-    homes: np.ndarray, heavy: np.ndarray, gap: float, limits: tuple[float, float]
-) -> np.ndarray:
-    """Points ``[n, 2]`` near their homes, some ``gap`` from each other and within ``limits``.
-
-    Points push each other away until none overlap; those with room around them stay at home, and
-    ``heavy`` ones give way last.
-    """
-    # Equal points start apart, each in a direction of its own.
-    index = np.arange(len(homes))
-    equal = np.all(homes[:, None] == homes[None], axis=-1)
-    angle = np.pi + 2.4 * index
-    nudge = 0.05 * gap * np.stack([np.sin(angle), np.cos(angle)], axis=1)
-    shared = equal.sum(axis=1) > 1
-    points = homes + np.where((shared & ~heavy)[:, None], nudge, 0.0)
-    pace = np.where(heavy, 0.02, 0.4)[:, None]
-    for _ in range(300):
-        apart = points[:, None] - points[None]
-        distance = np.linalg.norm(apart, axis=-1) + np.where(np.eye(len(homes)), np.inf, 1e-9)
-        overlap = np.maximum(gap - distance, 0.0)
-        points = points + pace * np.sum(apart * (overlap / distance)[..., None], axis=1)
-        points = np.clip(points, *limits)
-    return points
-
-
 def _draw_marker(ax: Axes, marker: _Marker, x: float, y: float, size: float) -> None:
-    radius = 0.6 * size
-    shape: Patch
-    if marker.shape == "disc":
-        shape, edge = Circle((x, y), radius), "white"
-    else:
-        box = f"round,pad=0,rounding_size={0.25 * size}"
-        corner = (x - 0.9 * radius, y - 0.9 * radius)
-        shape, edge = FancyBboxPatch(corner, 1.8 * radius, 1.8 * radius, boxstyle=box), INK
-    shape.set(facecolor=marker.color, edgecolor=edge, linewidth=0.8, zorder=3)
-    ax.add_patch(shape)
-
-    # Black or white, whichever stands out more from the marker's color.
-    luminance = np.dot(to_rgb(marker.color), (0.299, 0.587, 0.114))
-    text = TextPath((0, 0), marker.label, size=1, prop=FONT)
-    bounds = text.get_extents()
-    center = -(bounds.x0 + bounds.x1) / 2, -(bounds.y0 + bounds.y1) / 2
-    height = 0.95 * size * (1.0 if len(marker.label) == 1 else 0.7)
-    upright = Affine2D().translate(*center).scale(height, -height).translate(x, y)
-    letter = PathPatch(
-        text.transformed(upright), facecolor=INK if luminance > 0.6 else "white", linewidth=0
-    )
-    letter.set(zorder=4, label=marker.label)
-    ax.add_patch(letter)
+    draw = draw_disc if marker.shape == "disc" else draw_box
+    draw(ax, marker.label, marker.color, x, y, size)

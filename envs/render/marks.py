@@ -1,0 +1,88 @@
+"""Labeled discs and boxes in units of cells, and room for those that would hide each other.
+
+Rows count downwards: letters stand upright on axes whose y grows towards the bottom.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.font_manager import FontProperties
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, FancyBboxPatch, Patch, PathPatch
+from matplotlib.textpath import TextPath
+from matplotlib.transforms import Affine2D
+
+from envs.render.palette import INK, PAPER, ink_on
+
+RADIUS = 0.6  # of a mark of size 1
+FONT = FontProperties(family="DejaVu Sans", weight="bold")
+
+
+def draw_disc(
+    ax: Axes, label: str, color: str, x: float, y: float, size: float, filled: bool = True
+) -> None:
+    """A disc in its color, or (not ``filled``) a ring of that color around a dark letter."""
+    disc = Circle((x, y), RADIUS * size, facecolor=color, edgecolor=PAPER, linewidth=0.8)
+    if not filled:
+        disc.set(radius=0.9 * RADIUS * size, facecolor=PAPER, edgecolor=color, linewidth=1.6)
+    _draw_labeled(ax, disc, label, ink_on(color) if filled else INK, x, y, size)
+
+
+def draw_box(ax: Axes, label: str, color: str, x: float, y: float, size: float) -> None:
+    """A box with round corners."""
+    half = 0.9 * RADIUS * size
+    style = f"round,pad=0,rounding_size={0.25 * size}"
+    box = FancyBboxPatch(
+        (x - half, y - half), 2 * half, 2 * half,
+        boxstyle=style, facecolor=color, edgecolor=INK, linewidth=0.8,
+    )  # fmt: skip
+    _draw_labeled(ax, box, label, ink_on(color), x, y, size)
+
+
+def draw_leader(ax: Axes, home: np.ndarray, center: np.ndarray) -> None:
+    """A thin line from the cell ``[2]`` that a mark belongs to, to where it is drawn ``[2]``."""
+    rows, columns = np.stack([home, center], axis=1)
+    line = Line2D(columns, rows, color=INK, linewidth=0.8, zorder=2.5)
+    line.set(marker="o", markersize=2.5, markevery=[0])
+    ax.add_line(line)
+
+
+def spread_apart(
+    homes: np.ndarray, heavy: np.ndarray, gap: float, limits: tuple[float, float]
+) -> np.ndarray:
+    """Points ``[n, 2]`` near their homes, some ``gap`` from each other and within ``limits``.
+
+    Points push each other away until none overlap; those with room around them stay at home, and
+    ``heavy`` ones give way last.
+    """
+    # Equal points start apart, each in a direction of its own.
+    index = np.arange(len(homes))
+    equal = np.all(homes[:, None] == homes[None], axis=-1)
+    angle = np.pi + 2.4 * index
+    nudge = 0.05 * gap * np.stack([np.sin(angle), np.cos(angle)], axis=1)
+    shared = equal.sum(axis=1) > 1
+    points = homes + np.where((shared & ~heavy)[:, None], nudge, 0.0)
+    pace = np.where(heavy, 0.02, 0.4)[:, None]
+    for _ in range(300):
+        apart = points[:, None] - points[None]
+        distance = np.linalg.norm(apart, axis=-1) + np.where(np.eye(len(homes)), np.inf, 1e-9)
+        overlap = np.maximum(gap - distance, 0.0)
+        points = points + pace * np.sum(apart * (overlap / distance)[..., None], axis=1)
+        points = np.clip(points, *limits)
+    return points
+
+
+def _draw_labeled(
+    ax: Axes, shape: Patch, label: str, ink: str, x: float, y: float, size: float
+) -> None:
+    shape.set(zorder=3)
+    ax.add_patch(shape)
+    text = TextPath((0, 0), label, size=1, prop=FONT)
+    bounds = text.get_extents()
+    center = -(bounds.x0 + bounds.x1) / 2, -(bounds.y0 + bounds.y1) / 2
+    height = 0.95 * size * (1.0 if len(label) == 1 else 0.7)
+    upright = Affine2D().translate(*center).scale(height, -height).translate(x, y)
+    letter = PathPatch(text.transformed(upright), facecolor=ink, linewidth=0)
+    letter.set(zorder=4, label=label)
+    ax.add_patch(letter)

@@ -1,0 +1,68 @@
+"""Figures of every world: curves of adaptation (figures 6 and 7 of the paper) and of pre-training."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from envs.render import INK
+from experiments.figures.style import METHODS, method_styles, styled
+from experiments.results import Results
+from mgpo_jax.errors import DataError
+
+
+@styled
+def learning_curve(results: Mapping[str, Results], title: str | None = None) -> Figure:
+    """Figures 6 and 7: return of the optimized prompt over the episodes of adaptation.
+
+    Lines are means over tasks and seeds, bands the standard deviation over seeds.
+    """
+    figure = Figure(figsize=(3.6, 2.7), layout="constrained")
+    ax = figure.add_subplot()
+    for label, (name, color, line, marker) in method_styles(results).items():
+        result = results[label]
+        by_seed = result.eval_returns.mean(axis=1)
+        mean, std = by_seed.mean(axis=0), by_seed.std(axis=0)
+        episodes = result.eval_episodes
+        ax.plot(
+            episodes, mean, label=name, color=color, linestyle=line, marker=marker,
+            markeredgecolor="white", markeredgewidth=0.6,
+        )  # fmt: skip
+        if len(by_seed) > 1:
+            ax.fill_between(episodes, mean - std, mean + std, color=color, alpha=0.16, linewidth=0)
+    optima = {round(float(result.optimal_returns.mean()), 6) for result in results.values()}
+    for index, optimum in enumerate(sorted(optima)):
+        label = "_" if index else "optimum"
+        ax.axhline(optimum, color=INK, linestyle=(0, (4, 3)), linewidth=1.0, label=label, zorder=1)
+    ax.set(xlabel="episodes", ylabel="return of the optimized prompt", title=title or "")
+    ax.set_xlim(left=0)
+    ax.margins(y=0.08)
+    ax.legend(loc="best")
+    return figure
+
+
+@styled
+def training_curve(metrics: Path) -> Figure:
+    """Losses of a pre-training run and its greedy returns on the way, from ``metrics.jsonl``."""
+    try:
+        rows = [json.loads(line) for line in metrics.read_text().splitlines()]
+        steps = [row["step"] for row in rows]
+    except (OSError, ValueError, TypeError, KeyError):
+        raise DataError(f"{metrics} is missing or not readable JSON lines") from None
+    figure = Figure(figsize=(6.4, 2.4), layout="constrained")
+    panels = (
+        ("loss", {"train/loss": "training", "val/loss": "held out"}),
+        ("return of the initial prompt", {"eval/initial_return": "_"}),
+    )
+    colors = (METHODS["bpe"][1], METHODS["ucb"][1])
+    for ax, (ylabel, names) in zip(figure.subplots(1, 2), panels, strict=True):
+        for (name, label), color in zip(names.items(), colors, strict=False):
+            values = [row.get(name, np.nan) for row in rows]
+            ax.plot(steps, values, color=color, label=label, marker="o", markersize=3)
+        ax.set(xlabel="steps", ylabel=ylabel)
+    figure.axes[0].legend()
+    return figure
