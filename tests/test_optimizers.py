@@ -14,7 +14,13 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from mgpo_jax.optimizers import OPTIMIZERS, SearchSpace
-from mgpo_jax.optimizers.arms import empty_arms, insert_arm, update_arm
+from mgpo_jax.optimizers.arms import (
+    SHRINKAGE,
+    empty_arms,
+    estimated_returns,
+    insert_arm,
+    update_arm,
+)
 from mgpo_jax.optimizers.bpe import posterior, shortfall
 from mgpo_jax.optimizers.grips import edit
 from mgpo_jax.optimizers.ucb import upper_confidence_bounds
@@ -378,6 +384,23 @@ def test_a_full_table_replaces_the_worst_greedy_return():
     np.testing.assert_allclose(arms.mean, [0.5, 0.7, 0.9])
     np.testing.assert_array_equal(arms.pulls, [1, 1, 1])
     np.testing.assert_array_equal(arms.sum_sq, [0, 0, 0])
+
+
+def test_the_optimized_prompt_is_not_the_luckiest_one():
+    """One high return of a world of chance does not beat many good ones; without chance it does."""
+    histories = [[0.5, 0.2], [0.9], [0.8, 0.7, 0.8, 0.7, 0.75, 0.75]]
+    arms = arms_of(histories)
+    overall = np.mean(sum(histories, []))
+    expected = [
+        (np.sum(history) + SHRINKAGE * overall) / (len(history) + SHRINKAGE) for history in histories
+    ]
+    noisy = np.asarray(estimated_returns(arms, deterministic=False))
+    np.testing.assert_allclose(noisy[:3], expected, rtol=1e-5)
+    assert (noisy[3:] == -np.inf).all()
+    assert int(np.argmax(noisy)) == 2
+    exact = np.asarray(estimated_returns(arms, deterministic=True))
+    np.testing.assert_allclose(exact[:3], [0.5, 0.9, 0.8])
+    assert (exact[3:] == -np.inf).all()
 
 
 def test_hyper_parameters_can_be_swept_by_vmap():
