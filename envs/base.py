@@ -31,6 +31,8 @@ class EnvSpec:
         task goal (paper, appendix D: true in MazeRunner, where every position is a goal).
       deterministic: whether task and actions determine an episode; if not, one greedy episode is
         only a sample of what a prompt is worth.
+      reward_confirms_goals: whether a reward at a goal says that this goal was the right one at this
+        point, as where a sequence is rewarded part by part.
     """
 
     name: str
@@ -42,6 +44,7 @@ class EnvSpec:
     return_range: tuple[float, float]
     truncate_in_hindsight: bool
     deterministic: bool
+    reward_confirms_goals: bool
 
 
 class TimeStep(NamedTuple):

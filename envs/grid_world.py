@@ -71,6 +71,7 @@ class GridWorld:
             return_range=(0.0, 1.0),
             truncate_in_hindsight=False,
             deterministic=False,
+            reward_confirms_goals=True,
         )
 
     @property

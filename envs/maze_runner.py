@@ -62,6 +62,7 @@ class MazeRunner:
             return_range=(-STEP_PENALTY * self.horizon, GOAL_REWARD - STEP_PENALTY),
             truncate_in_hindsight=True,
             deterministic=True,
+            reward_confirms_goals=False,
         )
 
     @property

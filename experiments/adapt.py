@@ -69,7 +69,10 @@ class AdaptConfig(Common):
     """Episodes between evaluations of the best prompt, which are outside of the budget."""
     eval_episodes: int | None = None
     """Greedy episodes that an evaluation averages (default: 1 where task and actions determine an
-    episode, else 20)."""
+    episode, else 10)."""
+    keep_rewarded: bool | None = None
+    """UCB, BPE, explore: new prompts keep the goals of the best trajectory that were rewarded (default:
+    in worlds that reward a sequence part by part) [False]."""
     out: Path | None = None
     """Result folder (default: runs/adapt/ENV/BANDIT-seedSEED)."""
     figures: bool = True
@@ -221,6 +224,7 @@ def main(config: AdaptConfig) -> None:
         max_goals=config.max_goals,
         eval_every=config.eval_every,
         eval_episodes=config.eval_episodes,
+        keep_rewarded=config.keep_rewarded,
     )
     summary = save_results(folder, config, outcome, tasks, optimum)
     print(table(summary))

@@ -29,7 +29,7 @@ from mgpo_jax.types import Prompt
 
 LANES = "lanes"
 GROUP = 25  # lanes that share a clock, at most
-NUM_EVAL_EPISODES = 20  # of an evaluation, where starts or worlds are random
+NUM_EVAL_EPISODES = 10  # of an evaluation, where starts or worlds are random
 
 
 class Outcome(NamedTuple):
@@ -60,6 +60,7 @@ def run_adaptation(
     max_goals: int | None = None,
     eval_every: int = 10,
     eval_episodes: int | None = None,
+    keep_rewarded: bool | None = None,
 ) -> Outcome:
     """Adapt to every task with every seed; ``make_optimizer(space)`` makes the optimizer."""
     variant = {} if max_goals is None else {"max_goals": max_goals}
@@ -74,6 +75,7 @@ def run_adaptation(
         seed=seed,
         eval_every=eval_every,
         eval_episodes=eval_episodes,
+        keep_rewarded=keep_rewarded,
     )
     return outcome
 
@@ -90,6 +92,7 @@ def run_variants(
     seed: int = 0,
     eval_every: int = 10,
     eval_episodes: int | None = None,
+    keep_rewarded: bool | None = None,
 ) -> list[Outcome]:
     """One outcome for each variant of the optimizer; all see the same tasks and random keys.
 
@@ -106,9 +109,12 @@ def run_variants(
       eval_every: episodes between evaluations of the best prompt.
       eval_episodes: greedy episodes that an evaluation averages (default: 1 in deterministic worlds,
         else ``NUM_EVAL_EPISODES``).
+      keep_rewarded: whether bandits keep the rewarded goals of the best trajectory (default: where
+        ``EnvSpec.reward_confirms_goals``).
     """
     num, mesh = num_tasks(tasks), device_mesh()
     eval_episodes = eval_episodes or (1 if env.spec.deterministic else NUM_EVAL_EPISODES)
+    keep_rewarded = env.spec.reward_confirms_goals if keep_rewarded is None else keep_rewarded
     lanes = len(variants) * seeds * num
     on_each = -(-lanes // mesh.devices.size)
     num_groups = -(-on_each // GROUP)
@@ -130,6 +136,7 @@ def run_variants(
             episodes,
             hyper.get("max_goals"),
             env.spec.deterministic,
+            keep_rewarded,
         )
         options = {name: value for name, value in hyper.items() if name != "max_goals"}
         return policy, make_optimizer(space, **options)

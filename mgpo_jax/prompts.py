@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from mgpo_jax.types import PRNGKeyArray, Prompt, Trajectory
 
@@ -25,12 +25,25 @@ def hindsight_outcome(trajectory: Trajectory) -> Float[Array, "G"]:
     return trajectory.outcomes[trajectory.length - 1]
 
 
+def until_reached(trajectory: Trajectory, goal: Float[Array, "G"]) -> Trajectory:
+    """The trajectory up to the first step whose outcome is ``goal``; all of it if there is none.
+
+    Some episodes go on after that: objects switched on in a wrong order leave the task unsolved, and
+    what is done then is on the way to nothing.
+    """
+    reached = jnp.all(trajectory.outcomes == goal, axis=-1)
+    reached &= jnp.arange(len(reached)) < trajectory.length
+    length = jnp.where(jnp.any(reached), 1 + jnp.argmax(reached), trajectory.length)
+    return trajectory._replace(length=length.astype(trajectory.length.dtype))
+
+
 def sample_prompt(
     key: PRNGKeyArray,
     trajectory: Trajectory,
     final_goal: Float[Array, "G"],
     num_slots: int,
     max_goals: int | Int[Array, ""] | None = None,
+    kept: Bool[Array, "T"] | None = None,
 ) -> Prompt:
     """Draw (g_i1, .., g_ik, final_goal) with k ~ U[0, K-1] and i1 < .. < ik from a trajectory.
 
@@ -41,6 +54,8 @@ def sample_prompt(
         adaptation the task goal g^M.
       num_slots: P, the number of slots of the returned prompt (static).
       max_goals: K <= P, the largest number of goals with the final one (traced; default P).
+      kept: steps whose goals are in every prompt, as far as there is room; the number of goals is
+        then uniform between those kept and those there are (not in the paper; default none).
 
     Returns:
       A right-aligned prompt; goals keep the order in which the trajectory reached them.
@@ -55,12 +70,18 @@ def sample_prompt(
     eligible = trajectory.goal_reached & (time < trajectory.length) & ~repeats_end
 
     max_goals = num_slots if max_goals is None else max_goals
-    count = jax.random.randint(key_count, (), 0, max_goals)
-    count = jnp.minimum(count, eligible.sum())
+    if kept is None:
+        count = jnp.minimum(jax.random.randint(key_count, (), 0, max_goals), eligible.sum())
+    else:
+        kept &= eligible
+        most = jnp.minimum(max_goals - 1, eligible.sum())
+        count = jax.random.randint(key_count, (), jnp.minimum(kept.sum(), most), most + 1)
 
     num_drawn = min(num_slots - 1, num_steps)
     rank = jnp.arange(num_drawn)
     scores = jnp.where(eligible, jax.random.uniform(key_index, (num_steps,)), -1.0)
+    if kept is not None:
+        scores = jnp.where(kept, 2.0, scores)
     _, drawn = jax.lax.top_k(scores, num_drawn)
     drawn = jnp.sort(jnp.where(rank < count, drawn, -1))  # unused slots first, then in order
 

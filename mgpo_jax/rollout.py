@@ -52,7 +52,7 @@ def prompted(policy: Policy, query: Query) -> Agent:
 
 
 class _Loop(NamedTuple):
-    """State of an episode in progress; ``record`` holds its steps so far."""
+    """State of an episode in progress; ``record`` and ``rewards`` hold its steps so far."""
 
     time: Int[Array, ""]
     anyone_alive: Bool[Array, ""]
@@ -61,6 +61,7 @@ class _Loop(NamedTuple):
     timestep: TimeStep
     memory: Any
     record: Trajectory
+    rewards: Array
     return_: Array
 
 
@@ -88,7 +89,7 @@ def run_episode(
 
     def take(
         time: Array, alive: Array, state: State, obs: Array, action: Array, memory: Any,
-        record: Trajectory, return_: Array,
+        record: Trajectory, rewards: Array, return_: Array,
     ) -> _Loop:  # fmt: skip
         state, timestep = env.step(state, action)
         now = (obs, action, timestep.goal, timestep.goal_reached, timestep.outcome)
@@ -99,9 +100,12 @@ def run_episode(
 
         rows = [put(rows, row) for rows, row in zip(record[:-1], now, strict=True)]
         record = Trajectory(*rows, length=record.length + alive)
+        rewards = put(rewards, timestep.reward)
         return_ = return_ + jnp.where(alive, timestep.reward, 0.0)
         alive = alive & ~timestep.terminated & ~timestep.truncated
-        return _Loop(time + 1, anyone(alive), alive, state, timestep, memory, record, return_)
+        return _Loop(
+            time + 1, anyone(alive), alive, state, timestep, memory, record, rewards, return_
+        )
 
     def advance(loop: _Loop) -> _Loop:
         step_key = jax.random.fold_in(key_steps, loop.time)
@@ -115,6 +119,7 @@ def run_episode(
             action,
             memory,
             loop.record,
+            loop.rewards,
             loop.return_,
         )
 
@@ -127,7 +132,15 @@ def run_episode(
         length=jnp.zeros((), jnp.int32),
     )
     loop = take(
-        jnp.zeros((), jnp.int32), ~quits, state, timestep.obs, action, memory, blank, jnp.zeros(())
+        jnp.zeros((), jnp.int32),
+        ~quits,
+        state,
+        timestep.obs,
+        action,
+        memory,
+        blank,
+        jnp.zeros(horizon),
+        jnp.zeros(()),
     )
     # Memory grows between segments, so that a step costs what has been seen, not the horizon.
     for start in range(1, horizon, -(-horizon // NUM_SEGMENTS)):
@@ -136,4 +149,4 @@ def run_episode(
         loop = jax.lax.while_loop(
             lambda loop, end=end: loop.anyone_alive & (loop.time < end), advance, loop
         )
-    return Episode(loop.record, loop.return_)
+    return Episode(loop.record, loop.rewards, loop.return_)

@@ -47,5 +47,6 @@ class Episode(NamedTuple):
     """One finished episode of the policy."""
 
     trajectory: Trajectory
+    rewards: Float[Array, "*batch T"]
     return_: Float[Array, "*batch"]
     """Undiscounted sum of rewards."""

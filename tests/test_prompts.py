@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from mgpo_jax.prompts import hindsight_outcome, sample_prompt, single_goal
+from mgpo_jax.prompts import hindsight_outcome, sample_prompt, single_goal, until_reached
 from mgpo_jax.types import Trajectory
 
 NUM_STEPS = 9
@@ -155,3 +155,48 @@ def test_single_goal_fills_the_last_slot():
 def test_hindsight_outcome_is_read_at_the_last_real_step():
     trajectory = make_trajectory([True] * NUM_STEPS, 5)
     np.testing.assert_array_equal(hindsight_outcome(trajectory), [5.5, 104.5])
+
+
+@jax.jit
+def draw_kept(seed, trajectory, max_goals, kept):
+    keys = jax.random.split(jax.random.key(seed), 600)
+    return jax.vmap(lambda k: sample_prompt(k, trajectory, FINAL, NUM_SLOTS, max_goals, kept))(keys)
+
+
+@pytest.mark.parametrize(
+    ("kept", "max_goals", "always", "sizes"),
+    [
+        ([], 4, [], {1, 2, 3, 4}),
+        ([2], 4, [2], {2, 3, 4}),
+        ([2, 5], 4, [2, 5], {3, 4}),
+        ([2, 5], 3, [2, 5], {3}),
+        ([1, 2, 5, 6], 4, [1, 2, 5], {4}),  # no room for all: the first ones
+        ([2, 5], 1, [], {1}),
+        ([0, 8], 4, [], {1, 2, 3, 4}),  # not reached, and beyond the end
+    ],
+)
+def test_kept_goals_are_in_every_prompt(kept, max_goals, always, sizes):
+    trajectory = make_trajectory([False, *[True] * (NUM_STEPS - 1)], length=8)
+    drawn = draw_kept(
+        0, trajectory, max_goals, jnp.isin(jnp.arange(NUM_STEPS), jnp.array(kept, int))
+    )
+    steps = np.where(np.asarray(drawn.mask), np.asarray(drawn.goals)[..., 0] - 1, np.nan)
+    assert set(np.asarray(drawn.mask).sum(axis=1).tolist()) == sizes
+    for row in steps:
+        named = row[np.isfinite(row)][:-1]
+        assert set(always) <= set(named.tolist())
+        assert (np.diff(named) > 0).all()
+    # The other goals are as likely as each other.
+    others = [step for step in range(1, 8) if step not in always]
+    counts = [(steps == step).sum() for step in others]
+    assert max(counts) < 1.5 * max(min(counts), 1)
+
+
+def test_a_trajectory_ends_where_it_reaches_the_goal():
+    trajectory = make_trajectory([True] * NUM_STEPS, length=7)
+    for step, length in ((0, 1), (3, 4), (6, 7), (7, 7)):  # step 7 is padding
+        goal = jnp.array([step + 1.5, step + 100.5])
+        assert int(until_reached(trajectory, goal).length) == length
+    cut = until_reached(trajectory, jnp.array([4.5, 103.5]))
+    drawn = draw_many(0, cut, NUM_SLOTS)
+    assert np.nanmax(np.where(drawn.mask[:, :-1], drawn.goals[:, :-1, 0], np.nan)) == 4

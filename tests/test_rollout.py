@@ -92,6 +92,8 @@ def test_a_scripted_episode_is_recorded_exactly():
     reached = [(4, 3), (4, 3), (3, 3), (3, 2), (3, 2), (3, 1)]
     assert int(trajectory.length) == 6
     assert float(episode.return_) == pytest.approx(1 - 6 * 0.1)
+    rewards = [-0.1] * 5 + [0.9] + [0] * 6
+    np.testing.assert_allclose(episode.rewards, rewards, atol=1e-6)
     np.testing.assert_allclose(trajectory.obs[:6] * 7, seen, atol=1e-5)
     np.testing.assert_array_equal(trajectory.actions[:6], actions)
     np.testing.assert_allclose(trajectory.goals[:6] * 7, reached, atol=1e-5)

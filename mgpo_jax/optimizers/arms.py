@@ -2,12 +2,20 @@
 
 UCB, BPE and the explore ablation differ only in which prompt they act with next; ``bandit`` is the
 rest. After the first episode, which evaluates (g^M) greedily, episodes alternate: one samples actions
-under the chosen prompt, the next evaluates greedily a new prompt drawn from the best trajectory so far.
-The new prompt becomes an arm if its return beats the best mean of the table.
+under the chosen prompt, the next evaluates a new prompt drawn from the best trajectory so far. The new
+prompt becomes an arm if its return beats the best mean of the table.
 
-As in the authors' code the chosen prompt acts by sampling, new prompts are evaluated greedily, and
-among trajectories of equal return the newest counts as the best. Unlike it, an arm is inserted when it
-beats the best *mean* (as the paper has it), and the first evaluation counts as an episode.
+The evaluation of a new prompt is greedy where that gives its exact worth (as in the authors' code), and
+samples actions in a world of chance (as the text has it): there one greedy episode is a draw as well,
+and sampling finds orders of goals that greedy actions never take.
+
+Where a reward confirms the goals that led to it (``SearchSpace.keep_rewarded``; not in the paper), new
+prompts keep the rewarded goals of the best trajectory and vary the rest: what earned k/n of a
+sequence is its first k parts.
+
+As in the authors' code the chosen prompt acts by sampling, and among trajectories of equal return the
+newest counts as the best. Unlike it, an arm is inserted when it beats the best *mean* (as the paper has
+it), and the first evaluation counts as an episode.
 """
 
 from __future__ import annotations
@@ -20,7 +28,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mgpo_jax.optimizers.base import PromptOptimizer, SearchSpace, choose
-from mgpo_jax.prompts import sample_prompt, single_goal
+from mgpo_jax.prompts import sample_prompt, single_goal, until_reached
 from mgpo_jax.types import Episode, PRNGKeyArray, Prompt, Query, Trajectory
 
 MAX_ARMS = 64
@@ -35,8 +43,8 @@ class Arms(NamedTuple):
     mean: Float[Array, "M"]
     sum_sq: Float[Array, "M"]
     """Sum of squared deviations from the mean (Welford)."""
-    greedy_return: Float[Array, "M"]
-    """Return of the greedy evaluation that made the prompt an arm."""
+    entry_return: Float[Array, "M"]
+    """Return of the evaluation that made the prompt an arm."""
     size: Int[Array, ""]
 
     @property
@@ -62,14 +70,14 @@ def empty_arms(num_arms: int, num_slots: int, goal_dim: int) -> Arms:
 
 def insert_arm(arms: Arms, prompt: Prompt, return_: Float[Array, ""]) -> Arms:
     """A new arm with history {return_}; in a full table it replaces the worst greedy return."""
-    worst = jnp.argmin(jnp.where(arms.taken, arms.greedy_return, jnp.inf))
+    worst = jnp.argmin(jnp.where(arms.taken, arms.entry_return, jnp.inf))
     row = jnp.where(arms.size < len(arms.pulls), arms.size, worst)
     return Arms(
         prompts=jax.tree.map(lambda rows, new: rows.at[row].set(new), arms.prompts, prompt),
         pulls=arms.pulls.at[row].set(1.0),
         mean=arms.mean.at[row].set(return_),
         sum_sq=arms.sum_sq.at[row].set(0.0),
-        greedy_return=arms.greedy_return.at[row].set(return_),
+        entry_return=arms.entry_return.at[row].set(return_),
         size=jnp.minimum(arms.size + 1, len(arms.pulls)),
     )
 
@@ -77,13 +85,13 @@ def insert_arm(arms: Arms, prompt: Prompt, return_: Float[Array, ""]) -> Arms:
 def estimated_returns(arms: Arms, deterministic: bool) -> Float[Array, "M"]:
     """What each prompt is expected to return when it acts greedily; -inf for free rows.
 
-    In a deterministic world the one greedy evaluation is the answer. Elsewhere it is a draw, and the
-    best of many draws is mostly luck (the authors' code reports it): there the estimate is the mean of
-    all returns of the arm, shrunk towards the mean of the table as by ``SHRINKAGE`` more episodes
-    of that return.
+    In a deterministic world the one greedy evaluation is the answer. Elsewhere an evaluation is a draw,
+    and the best of many draws is mostly luck (the authors' code reports it): there the estimate is the
+    mean of all returns of the arm, shrunk towards the mean of the table as by ``SHRINKAGE`` more
+    episodes of that return.
     """
     if deterministic:
-        return arms.greedy_return
+        return arms.entry_return
     overall = jnp.sum(arms.pulls * arms.mean) / jnp.maximum(jnp.sum(arms.pulls), 1)
     shrunk = (arms.pulls * arms.mean + SHRINKAGE * overall) / (arms.pulls + SHRINKAGE)
     return jnp.where(arms.taken, shrunk, -jnp.inf)
@@ -116,6 +124,8 @@ class BanditState(NamedTuple):
     """R*."""
     best_trajectory: Trajectory
     """tau*; blank before the first episode."""
+    confirmed: Bool[Array, "T"]
+    """Steps of tau* that reached a goal and were rewarded."""
 
 
 Select = Callable[[PRNGKeyArray, BanditState], Int[Array, ""]]
@@ -133,7 +143,8 @@ def bandit(space: SearchSpace, select: Select, act_with_newest: bool = False) ->
         arms = empty_arms(num_arms, space.num_slots, task_goal.shape[-1])
         first = single_goal(task_goal, space.num_slots)
         zero = jnp.int32(0)
-        return BanditState(task_goal, arms, zero, zero, first, jnp.float32(-jnp.inf), blank)
+        none = jnp.zeros_like(blank.goal_reached)
+        return BanditState(task_goal, arms, zero, zero, first, jnp.float32(-jnp.inf), blank, none)
 
     def ask(key: PRNGKeyArray, state: BanditState) -> tuple[Query, BanditState]:
         key_select, key_prompt = jax.random.split(key)
@@ -141,18 +152,26 @@ def bandit(space: SearchSpace, select: Select, act_with_newest: bool = False) ->
         arm = select(key_select, state)
         chosen = state.newest if act_with_newest else state.arms.prompt(arm)
         drawn = sample_prompt(
-            key_prompt, state.best_trajectory, state.task_goal, space.num_slots, space.max_goals
+            key_prompt,
+            state.best_trajectory,
+            state.task_goal,
+            space.num_slots,
+            space.max_goals,
+            state.confirmed if space.keep_rewarded else None,
         )
         keeps = acts | (state.episode == 0)
         newest = choose(keeps, state.newest, drawn)
         prompt = choose(acts, chosen, newest)
-        return Query(prompt, ~acts), state._replace(arm=arm, newest=newest)
+        # Of a world of chance a greedy episode is no exact measure either, and explores less.
+        greedy = (state.episode == 0) | (~acts & space.deterministic)
+        return Query(prompt, greedy), state._replace(arm=arm, newest=newest)
 
     def tell(state: BanditState, query: Query, episode: Episode) -> BanditState:
         return_ = episode.return_
         best_mean = jnp.max(jnp.where(state.arms.taken, state.arms.mean, -jnp.inf))
-        inserts = query.greedy & (return_ > best_mean)
-        sampled = ~query.greedy & (not act_with_newest)
+        acted = state.episode % 2 == 1
+        inserts = ~acted & (return_ > best_mean)
+        sampled = acted & (not act_with_newest)
         inserted = insert_arm(state.arms, query.prompt, return_)
         updated = update_arm(state.arms, state.arm, return_)
         improves = return_ >= state.best_return
@@ -160,7 +179,12 @@ def bandit(space: SearchSpace, select: Select, act_with_newest: bool = False) ->
             arms=choose(inserts, inserted, choose(sampled, updated, state.arms)),
             episode=state.episode + 1,
             best_return=jnp.maximum(return_, state.best_return),
-            best_trajectory=choose(improves, episode.trajectory, state.best_trajectory),
+            best_trajectory=choose(
+                improves, until_reached(episode.trajectory, state.task_goal), state.best_trajectory
+            ),
+            confirmed=jnp.where(
+                improves, episode.trajectory.goal_reached & (episode.rewards > 0), state.confirmed
+            ),
         )
 
     def best(state: BanditState) -> Prompt:

@@ -47,6 +47,8 @@ class SearchSpace:
     """K, the longest prompt to try; None means ``num_slots``."""
     deterministic: bool = True
     """Whether a prompt's greedy episode always has the same return."""
+    keep_rewarded: bool = False
+    """Whether prompts drawn from a trajectory keep the goals that were rewarded (bandits)."""
 
     @property
     def longest(self) -> int | Int[Array, ""] | Any:
