@@ -108,7 +108,9 @@ def bench_collect(env: Environment, episodes: int) -> tuple[Dataset, Row]:
 def bench_gradient_step(env: Environment, dataset: Dataset, num_steps: int) -> Iterator[Row]:
     """Steps of the default recipe over its own stream of batches."""
     config = pretrain_preset(env.spec.name, "fast")
-    network = network_config(env.spec, dropout=config.dropout)
+    network = network_config(
+        env.spec, dropout=config.dropout, max_prompt_length=config.max_prompt_length
+    )
     mesh = device_mesh(largest_divisor(config.train.part_size, len(jax.devices())))
     trainer = make_trainer(config.train, network, dataset, mesh)
     stream = batch_stream(config.train, dataset, env.spec.truncate_in_hindsight, mesh.devices.size)
@@ -175,19 +177,20 @@ def bench_decode(env: Environment, network: LoadedPolicy, note: str) -> Iterator
     for position in (horizon // 8, horizon // 2, horizon):
         room = jax.vmap(lambda cache, n=position - 1: policy.grow(cache, n))(carry)
 
-        @jax.jit
-        def decode(cache: Any, steps: int = min(16, position - 1)) -> Any:
-            def step(cache: Any, _: None) -> tuple[Any, None]:
-                return jax.vmap(policy.decode)(cache, action, first.obs)[1], None
+        num_steps = min(16, position - 1)
 
-            return jax.lax.scan(step, cache, length=steps)[0].step, steps
+        @jax.jit
+        def decode(cache: Any, num_steps: int = num_steps) -> Any:
+            def step(cache: Any, _: None) -> tuple[Any, Any]:
+                distribution, cache = jax.vmap(policy.decode)(cache, action, first.obs)
+                return cache, distribution  # what is not returned is not computed either
+
+            return jax.lax.scan(step, cache, length=num_steps)
 
         jax.block_until_ready(decode(room))
-        (_, steps), cpu = cpu_time(lambda decode=decode, room=room: decode(room))
-        name = f"decode at {position}"
-        yield Row(
-            name, 1e3 * cpu / lanes / int(steps), "CPU-ms / step", f"{lanes} episodes at once"
-        )
+        _, cpu = cpu_time(lambda decode=decode, room=room: decode(room))
+        cost = 1e3 * cpu / lanes / num_steps
+        yield Row(f"decode at {position}", cost, "CPU-ms / step", f"{lanes} episodes at once")
 
     endless: Any = Endless(env)
 
@@ -197,11 +200,11 @@ def bench_decode(env: Environment, network: LoadedPolicy, note: str) -> Iterator
             lambda key, task, prompt: evaluate(key, endless, policy, task, prompt, LANES),
             axis_name=LANES,
         )
-        return run(keys, tasks, prompts).trajectory.length
+        return run(keys, tasks, prompts)
 
     jax.block_until_ready(episodes(keys))
-    lengths, cpu = cpu_time(lambda: episodes(keys))
-    mean = float(lengths.mean())
+    done, cpu = cpu_time(lambda: episodes(keys))
+    mean = float(done.trajectory.length.mean())
     yield Row("full episode", cpu / lanes, "CPU-s", f"{note}, all {mean:.0f} steps of the horizon")
 
 

@@ -153,7 +153,7 @@ def adapted(
     )
     optimum = np.asarray(jax.jit(jax.vmap(env.optimal_return))(tasks))
     for (folder, variant), outcome in zip(folders.items(), outcomes, strict=True):
-        if folder.exists():
+        if (folder / "summary.json").is_file():
             continue
         adapt = AdaptConfig(
             env=config.env,

@@ -4,7 +4,7 @@ Settings that matter on a CPU, all in one place:
 
 - One XLA device a core. The programs here are small; one on each core wastes less than one on all.
 - The C library never gives memory back to the kernel: a gradient step frees and allocates hundreds of
-  MB, and every page that comes back from the kernel costs a fault (they doubled the time of a step).
+  MB, and every page that comes back from the kernel costs a fault.
   One arena for all threads, as those of threads return their memory however they are set.
 - jax's persistent compilation cache (``~/.cache/mgpo_jax``, or ``$MGPO_CACHE``): the second run of a
   command starts in seconds.

@@ -101,6 +101,7 @@ def run_episode(
         rows = [put(rows, row) for rows, row in zip(record[:-1], now, strict=True)]
         record = Trajectory(*rows, length=record.length + alive)
         rewards = put(rewards, timestep.reward)
+        # Summed step by step: equal rewards make equal returns, whenever they came.
         return_ = return_ + jnp.where(alive, timestep.reward, 0.0)
         alive = alive & ~timestep.terminated & ~timestep.truncated
         return _Loop(

@@ -33,7 +33,7 @@ def switcher() -> Agent:
         down, right = target - state.position
         along_column = jnp.where(down > 0, SOUTH, NORTH)
         along_row = jnp.where(right > 0, EAST, WEST)
-        vertical = jnp.where(right == 0, True, (down != 0) & jax.random.bernoulli(key))
+        vertical = (right == 0) | ((down != 0) & jax.random.bernoulli(key))
         move = jnp.where(vertical, along_column, along_row)
         action = jnp.where((down == 0) & (right == 0), FLIP, move)
         return action, jnp.zeros((), bool), memory
