@@ -36,6 +36,8 @@ SPEC = EnvSpec(
     horizon=9,
     return_range=(0.0, 1.0),
     truncate_in_hindsight=True,
+    deterministic=True,
+    reward_confirms_goals=False,
 )
 LENGTHS = [3, 1, 9, 4]
 

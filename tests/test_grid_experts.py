@@ -62,7 +62,7 @@ def expert(all_orders):
     ]
     orders = all_orders[np.concatenate(spread)]
     done = episodes(jax.random.split(jax.random.key(0), len(orders)), orders)
-    trajectory, return_ = jax.tree.map(np.asarray, done)
+    trajectory, return_ = jax.tree.map(np.asarray, (done.trajectory, done.return_))
     return orders, trajectory.obs[:, 0, 7:].astype(int), trajectory, return_
 
 
