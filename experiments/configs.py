@@ -76,7 +76,7 @@ class PretrainConfig(Common):
     """Width of the network [128]."""
     num_layers: int = 3
     """Transformer blocks [3]."""
-    num_heads: int = 1
+    num_heads: int = 4
     """Attention heads [1]."""
     holdout: int = 200
     """Trajectories kept out of training for the validation loss."""
@@ -112,6 +112,7 @@ class Recipe:
     episodes: int
     max_prompt_length: int
     bucket: int
+    demonstrator: str | None = None
     save_every: int = 500
 
 
@@ -119,7 +120,14 @@ class Recipe:
 # 100,000 take a minute to collect and are not.
 FAST = {
     "maze15": Recipe(steps=20_000, episodes=100_000, max_prompt_length=5, bucket=4),
-    "maze30": Recipe(steps=6_000, episodes=30_000, max_prompt_length=10, bucket=32, save_every=250),
+    "maze30": Recipe(
+        steps=5_000,
+        episodes=30_000,
+        max_prompt_length=20,
+        bucket=32,
+        demonstrator="astar2",
+        save_every=250,
+    ),
     # Each of the 13,600 training tasks five times.
     "gridworld": Recipe(steps=8_000, episodes=68_000, max_prompt_length=8, bucket=8),
 }
@@ -141,7 +149,7 @@ def pretrain_preset(env: str, preset: str) -> PretrainConfig:
     fast = PretrainConfig(
         env=env,
         preset=preset,
-        data=DataConfig(episodes=recipe.episodes),
+        data=DataConfig(recipe.demonstrator, recipe.episodes),
         train=TrainConfig(steps=recipe.steps, bucket=recipe.bucket),
         max_prompt_length=recipe.max_prompt_length,
         save_every=recipe.save_every,
@@ -149,16 +157,17 @@ def pretrain_preset(env: str, preset: str) -> PretrainConfig:
     if preset == "paper":
         train = replace(
             fast.train,
+            optimizer="adamw",
             learning_rate=1e-4,
             warmup_steps=10_000,
             schedule="constant",
             clip_norm=0.25,
         )
-        return replace(fast, train=train, dropout=0.1, prompt_order=False)
+        return replace(fast, train=train, dropout=0.1, prompt_order=False, num_heads=1)
     if preset == "smoke":
         return replace(
             fast,
-            data=DataConfig(episodes=256),
+            data=replace(fast.data, episodes=256),
             train=replace(fast.train, steps=40, warmup_steps=10, bucket=8 * recipe.bucket),
             embed_dim=32,
             num_layers=2,

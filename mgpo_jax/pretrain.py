@@ -36,14 +36,16 @@ class TrainConfig:
     """Gradient steps [50,000* for maze15, 200,000* for maze30]."""
     batch_size: int = 64
     """Trajectories in a gradient step [64]."""
-    learning_rate: float = 1e-3
-    """Peak learning rate of AdamW [1e-4]."""
+    optimizer: Literal["muon", "adamw"] = "muon"
+    """Muon on the matrices of the blocks and AdamW on the rest, or AdamW alone [adamw]."""
+    learning_rate: float = 3e-3
+    """Peak learning rate [1e-4]."""
     warmup_steps: int = 300
     """Steps of linear warm-up [10,000]."""
     schedule: Literal["cosine", "constant"] = "cosine"
     """Decay after warm-up: to 2 % along a cosine, or none [constant*]."""
     weight_decay: float = 1e-4
-    """AdamW weight decay [1e-4]."""
+    """Weight decay [1e-4]."""
     clip_norm: float = 1.0
     """Largest global norm of the gradient [0.25*]."""
     part_size: int = 16
@@ -54,6 +56,10 @@ class TrainConfig:
     """Padded lengths are multiples of this many steps."""
     seed: int = 0
     """Seed of initial weights, batches, prompts and dropout."""
+
+
+# Root mean square of a typical AdamW update before the learning rate.
+ADAMW_RMS = 0.2
 
 
 class TrainState(NamedTuple):
@@ -79,11 +85,48 @@ def learning_rate_schedule(config: TrainConfig) -> optax.Schedule:
     return optax.linear_schedule(0.0, rate, warmup) if warmup else optax.constant_schedule(rate)
 
 
-def make_optimizer(config: TrainConfig) -> optax.GradientTransformation:
-    return optax.chain(
-        optax.clip_by_global_norm(config.clip_norm),
-        optax.adamw(learning_rate_schedule(config), weight_decay=config.weight_decay),
+def make_optimizer(
+    config: TrainConfig, unravel: Callable[[Array], Any]
+) -> optax.GradientTransformation:
+    """The optimizer, on weights that are one vector.
+
+    Muon (Jordan 2024) makes the update of a matrix orthogonal; its scale is matched to AdamW's (Liu et
+    al. 2025), so that one learning rate serves both.
+
+    Args:
+      config: settings of the training.
+      unravel: gives the vector's parts their shapes and names, which Muon needs.
+    """
+    rate, decay = learning_rate_schedule(config), config.weight_decay
+    clip = optax.clip_by_global_norm(config.clip_norm)
+    if config.optimizer == "adamw":
+        return optax.chain(clip, optax.adamw(rate, weight_decay=decay))
+    muon = optax.contrib.muon(
+        rate,
+        weight_decay=decay,
+        adam_weight_decay=decay,
+        consistent_rms=ADAMW_RMS,
+        muon_weight_dimension_numbers=_block_matrices,
     )
+
+    def init(weights: Array) -> Any:
+        return muon.init(unravel(weights))
+
+    def update(grads: Array, state: Any, weights: Array | None = None) -> tuple[Array, Any]:
+        updates, state = muon.update(unravel(grads), state, unravel(weights))
+        return ravel_pytree(updates)[0], state
+
+    return optax.chain(clip, optax.GradientTransformation(init, update))
+
+
+def _block_matrices(params: Any) -> Any:
+    """The matrices between hidden layers; embeddings and the head are left to AdamW."""
+
+    def kind(path: Any, leaf: Array) -> Any:
+        in_block = any(str(part.key).startswith("blocks") for part in path)
+        return optax.contrib.MuonDimensionNumbers() if in_block and leaf.ndim == 2 else None
+
+    return jax.tree_util.tree_map_with_path(kind, params)
 
 
 def bc_loss(
@@ -134,19 +177,22 @@ def make_trainer(
         raise ValueError(f"part_size {config.part_size} does not divide over {num_devices} devices")
     home = mesh.devices.flat[0]
     network = GoalTransformer(network_config)
-    optimizer = make_optimizer(config)
     key_init, key_steps, key_eval = jax.random.split(jax.random.key(config.seed), 3)
     flatten = jax.jit(lambda params: ravel_pytree(params)[0])
 
-    def init() -> TrainState:
+    def init_params() -> Any:
         first = jax.tree.map(jnp.asarray, dataset.gather(np.array([0]), np.array([1]), 1))
         one = jax.tree.map(lambda leaf: leaf[0], first)
         prompt = single_goal(one.outcomes[0], network_config.max_prompt_length)
-        params = network.init(key_init, prompt, one.obs, one.actions)
-        return TrainState(params, optimizer.init(flatten(params)), 0)
+        return network.init(key_init, prompt, one.obs, one.actions)
 
-    shapes = jax.eval_shape(init).params
+    shapes = jax.eval_shape(init_params)
     _, unravel = ravel_pytree(jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes))
+    optimizer = make_optimizer(config, unravel)
+
+    def init() -> TrainState:
+        params = init_params()
+        return TrainState(params, optimizer.init(flatten(params)), 0)
 
     def batch_loss(
         params: Any, keys: Key[Array, "B"], part: Trajectory, deterministic: bool

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 
 import envs
 from mgpo_jax.checkpoint import (
@@ -110,7 +111,8 @@ def test_policy_of_another_world(policy: Path) -> None:
 
 
 def train_state(params: dict, step: int) -> TrainState:
-    opt_state = make_optimizer(TrainConfig()).init(params)
+    weights, unravel = ravel_pytree(params)
+    opt_state = make_optimizer(TrainConfig(), unravel).init(weights)
     filled = jax.tree.map(lambda leaf: jnp.full_like(leaf, step), (params, opt_state))
     return TrainState(*filled, step)
 

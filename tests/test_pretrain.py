@@ -103,7 +103,7 @@ def test_the_loss_falls_and_a_resumed_run_equals_an_uninterrupted_one(noisy_trai
 
 def gradient(network, part_size, num_devices):
     """The gradient of the whole data set: AdamW's first moment is a tenth of the first one."""
-    config = replace(CONFIG, part_size=part_size)
+    config = replace(CONFIG, part_size=part_size, optimizer="adamw")
     trainer = make_trainer(config, network, DATASET, device_mesh(num_devices))
     state = trainer.init()
     params = to_host(state.params)
