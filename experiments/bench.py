@@ -25,10 +25,10 @@ from experiments.adaptation import GROUP, LANES, run_adaptation
 from experiments.collect import collect, find_demonstrator
 from experiments.configs import make_env, positive, pretrain_preset
 from experiments.policies import LoadedPolicy, load_network
+from experiments.pretrain import configured_network
 from experiments.runtime import Common, provenance, run, write_json
 from experiments.tasks import benchmark_tasks
 from mgpo_jax.adapt import evaluate
-from mgpo_jax.checkpoint import network_config
 from mgpo_jax.dataset import Dataset
 from mgpo_jax.errors import UsageError
 from mgpo_jax.optimizers import ucb
@@ -97,8 +97,9 @@ def sequence_flops(
 
 
 def bench_collect(env: Environment, episodes: int) -> tuple[Dataset, Row]:
-    """Demonstrations of the world's first demonstrator."""
-    name, demonstrator = find_demonstrator(env, None)
+    """Demonstrations for the default recipe."""
+    recipe = pretrain_preset(env.spec.name, "fast")
+    name, demonstrator = find_demonstrator(env, recipe.data.demonstrator)
     collect(env, demonstrator, 1, seed=1)  # compiles
     (dataset, _), cpu = cpu_time(lambda: collect(env, demonstrator, episodes, seed=0))
     note = f"{name}, {episodes} kept, task generation included"
@@ -108,9 +109,7 @@ def bench_collect(env: Environment, episodes: int) -> tuple[Dataset, Row]:
 def bench_gradient_step(env: Environment, dataset: Dataset, num_steps: int) -> Iterator[Row]:
     """Steps of the default recipe over its own stream of batches."""
     config = pretrain_preset(env.spec.name, "fast")
-    network = network_config(
-        env.spec, dropout=config.dropout, max_prompt_length=config.max_prompt_length
-    )
+    network = configured_network(config, env)
     mesh = device_mesh(largest_divisor(config.train.part_size, len(jax.devices())))
     trainer = make_trainer(config.train, network, dataset, mesh)
     stream = batch_stream(config.train, dataset, env.spec.truncate_in_hindsight, mesh.devices.size)
@@ -156,7 +155,7 @@ def policy_to_bench(env: Environment) -> tuple[LoadedPolicy, str]:
         return load_network(env, None), "released policy"
     except UsageError:
         fast = pretrain_preset(env.spec.name, "fast")
-        config = network_config(env.spec, max_prompt_length=fast.max_prompt_length)
+        config = configured_network(fast, env)
         blank = collect(env, find_demonstrator(env, None)[1], 4, seed=0)[0]
         params = make_trainer(fast.train, config, blank, device_mesh(1)).init().params
         return LoadedPolicy(config, params, {}), "untrained policy"

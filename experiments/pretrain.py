@@ -81,6 +81,12 @@ def _optional(module: str, extra: str) -> Any:
         ) from None
 
 
+def configured_network(config: PretrainConfig, env: Environment) -> TransformerConfig:
+    """The network of a run: its settings are those that both configs have."""
+    common = {f.name for f in fields(TransformerConfig)} & {f.name for f in fields(PretrainConfig)}
+    return network_config(env.spec, **{name: getattr(config, name) for name in common})
+
+
 def prepare_dataset(config: PretrainConfig, env: Environment) -> Dataset:
     """The run's dataset, collected first where it is not there yet; no test task is in it."""
     policy, _ = find_demonstrator(env, config.data.demonstrator)
@@ -179,10 +185,7 @@ def main(config: PretrainConfig) -> None:
     if not config.resume:
         refuse_existing(config.folder, "continue it with --resume", "choose another with --out")
     env = make_env(config.env)
-    network = network_config(
-        env.spec,
-        **{name: getattr(config, name) for name in _names(TransformerConfig, PretrainConfig)},
-    )
+    network = configured_network(config, env)
     dataset = prepare_dataset(config, env)
     folder = open_run(config)
 
@@ -242,12 +245,6 @@ def main(config: PretrainConfig) -> None:
 
     training_curve(folder / "metrics.jsonl").savefig(folder / "training.png")
     print(f"policy written to {folder / 'policy'}", file=sys.stderr)
-
-
-def _names(*classes: type) -> list[str]:
-    """Field names that dataclasses have in common."""
-    common = set.intersection(*({f.name for f in fields(c)} for c in classes))
-    return sorted(common)
 
 
 if __name__ == "__main__":
