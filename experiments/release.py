@@ -15,6 +15,7 @@ from pathlib import Path
 import jax
 import tyro
 
+from experiments.collect import find_demonstrator
 from experiments.configs import PRETRAINED, make_env
 from experiments.figures import training_curve
 from experiments.runtime import Common, refuse_existing, run
@@ -39,8 +40,8 @@ CARD = """# Multi-goal Transformer for {env}
 | --- | --- |
 | network | {num_layers} layers, width {embed_dim}, {num_heads} head(s), {num_weights:,} weights |
 | prompts | up to {max_prompt_length} goals, {order} |
-| data | {episodes:,} demonstrations, seed {data_seed} |
-| training | {steps:,} gradient steps of {batch_size} trajectories, {cpu_minutes:.0f} CPU-minutes |
+| data | {episodes:,} demonstrations of {demonstrator}, seed {data_seed} |
+| training | {steps:,} steps of {batch_size} trajectories, {optimizer}, {cpu_minutes:.0f} CPU-minutes |
 | validation loss | {val_loss:.4f} nats an action, accuracy {val_accuracy:.4f} |
 | greedy return of the prompt (g^M) | {initial:.3f} on {eval_tasks} tasks of the training's own |
 
@@ -87,9 +88,11 @@ def main(config: ReleaseConfig) -> None:
         max_prompt_length=network.max_prompt_length,
         order="with an order embedding" if network.prompt_order else "without an order embedding",
         episodes=settings["data"]["episodes"],
+        demonstrator=find_demonstrator(env, settings["data"]["demonstrator"])[0],
         data_seed=settings["data"]["data_seed"],
         steps=made["steps"],
         batch_size=settings["train"]["batch_size"],
+        optimizer=settings["train"]["optimizer"],
         cpu_minutes=cpu / 60,
         val_loss=last["val/loss"],
         val_accuracy=last["val/accuracy"],

@@ -17,10 +17,11 @@ import pytest
 import tyro
 
 import envs
-from experiments import adapt, collect, pretrain, runtime
+from experiments import adapt, collect, pretrain, release, runtime
 from experiments.adapt import AdaptConfig
 from experiments.collect import CollectConfig
 from experiments.configs import PretrainConfig, pretrain_default, pretrain_preset
+from experiments.release import ReleaseConfig
 from experiments.tasks import benchmark_tasks, load_tasks, sample_tasks, save_tasks, task_hashes
 from mgpo_jax.checkpoint import load_policy_files
 from mgpo_jax.dataset import load_dataset
@@ -42,6 +43,7 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
         "collect": (CollectConfig, collect.main),
         "pretrain": (tyro.conf.OmitArgPrefixes[PretrainConfig], pretrain.main, pretrain_default),
         "adapt": (tyro.conf.OmitArgPrefixes[AdaptConfig], adapt.main),
+        "release": (ReleaseConfig, release.main),
     }
 
     def call(line: str) -> tuple[int, str]:
@@ -311,3 +313,20 @@ def test_presets_differ_as_they_say() -> None:
     assert (paper.train.steps, paper.train.learning_rate, paper.dropout) == (50_000, 1e-4, 0.1)
     assert (paper.data.episodes, paper.prompt_order) == (10_000, False)
     assert replace(pretrain_default([]), preset="fast") == pretrain_preset("maze15", "fast")
+
+
+def test_release_packs_a_run_with_its_card(command: Run, workspace: Path) -> None:
+    assert command(f"release {RUN} --out packed") == (0, "released in packed\n")
+    config, _, made = load_policy_files(Path("packed"))
+    assert (config.embed_dim, made["steps"]) == (8, 6)
+    env = envs.make("maze15")
+    tasks = load_tasks(Path("packed/tasks.npz"), env)
+    assert (task_hashes(env, tasks) == task_hashes(env, benchmark_tasks(env))).all()
+    card = Path("packed/README.md").read_text()
+    assert "40 demonstrations of astar4, seed 0" in card
+    assert "6 steps of 8 trajectories, muon" in card
+    assert Path("packed/training.png").is_file()
+    code, text = command(f"release {RUN} --out packed")
+    assert (code, "packed exists already" in text) == (2, True)
+    code, text = command("release nowhere")
+    assert (code, "nowhere has no finished policy" in text) == (2, True)
