@@ -33,7 +33,7 @@ from mgpo_jax.optimizers import ucb
 
 EPISODES = 100  # of an adaptation
 # Gradient steps of each training of a table.
-STEPS = {"maze15": 4_000, "maze30": 2_000}
+STEPS = {"maze15": 2_000, "maze30": 1_000}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +47,7 @@ class ReproduceConfig(Common):
     only: tuple[str, ...] = ()
     """Names of the datasets (table5), or prompt lengths (figure8), to train on (default: all)."""
     steps: int | None = None
-    """Gradient steps of each training (default: 4,000 for maze15, 2,000 for maze30)."""
+    """Gradient steps of each training (default: 2,000 for maze15, 1,000 for maze30)."""
     episodes: int = 10_000
     """Trajectories of each dataset [10,000]."""
     seeds: int = 3
@@ -103,13 +103,14 @@ PAPER = {
 }
 
 
-def trained(config: ReproduceConfig, dataset: str, max_prompt_length: int) -> Path:
+def trained(config: ReproduceConfig, dataset: str, max_prompt_length: int | None = None) -> Path:
     """The policy of one training, which is run or continued if it is not finished."""
+    fast = pretrain_preset(config.env, "fast")
+    max_prompt_length = max_prompt_length or fast.max_prompt_length
     name = f"{dataset}-k{max_prompt_length}-{config.num_steps}steps-{config.episodes}episodes"
     folder = config.folder / "policies" / name
     if not (folder / "policy").is_dir():
         print(f"training {folder}", file=sys.stderr)
-        fast = pretrain_preset(config.env, "fast")
         pretrain(
             replace(
                 fast,
@@ -183,7 +184,7 @@ def table5(config: ReproduceConfig) -> list[Line]:
     """One policy for each dataset (Table 5)."""
     lines = []
     for dataset in chosen(config, ("random", "astar1", "astar2", "astar4")):
-        policy = trained(config, dataset, max_prompt_length=5)
+        policy = trained(config, dataset)
         results = config.folder / "table5" / f"{policy.parent.name}-{config.seeds}seeds"
         adapted(config, policy, {results: {}})
         lines.append(Line(dataset, results, PAPER[config.env][dataset]))
@@ -194,7 +195,7 @@ def figure8(config: ReproduceConfig) -> list[Line]:
     """One policy for each longest prompt K (Figure 8)."""
     lines = []
     for length in chosen(config, ("5", "10", "20", "40")):
-        policy = trained(config, "astar4", max_prompt_length=int(length))
+        policy = trained(config, "astar4", int(length))
         results = config.folder / "figure8" / f"{policy.parent.name}-{config.seeds}seeds"
         adapted(config, policy, {results: {}})
         lines.append(Line(f"K = {length}", results, ""))
