@@ -116,10 +116,10 @@ class Recipe:
     save_every: int = 500
 
 
-# Demonstrations are cheaper than regularization: 10,000 of maze15 are overfitted after 5,000 fast steps,
-# 100,000 take a minute to collect and are not.
+# Demonstrations are cheaper than regularization: 10,000 of maze15 are soon overfitted, 100,000 take a
+# minute to collect and are not.
 FAST = {
-    "maze15": Recipe(steps=20_000, episodes=100_000, max_prompt_length=5, bucket=4),
+    "maze15": Recipe(steps=8_000, episodes=100_000, max_prompt_length=5, bucket=4),
     "maze30": Recipe(
         steps=5_000,
         episodes=30_000,
@@ -129,7 +129,7 @@ FAST = {
         save_every=250,
     ),
     # Each of the 13,600 training tasks five times.
-    "gridworld": Recipe(steps=8_000, episodes=68_000, max_prompt_length=8, bucket=8),
+    "gridworld": Recipe(steps=3_000, episodes=68_000, max_prompt_length=8, bucket=8),
 }
 
 # Steps of the authors' code; their text gives none.
