@@ -1,7 +1,8 @@
 """Many adaptations in one compiled program: every variant, seed and task is a lane of its own.
 
 Lanes are spread over the devices and, on each, run in groups: the lanes of a group share one clock, so
-that a group's episode ends with its slowest lane, and their key-value caches stay small.
+that a group's episode ends with its slowest lane. Groups are as large as their key-value caches fit into
+the memory near a core; an episode of 500 steps has its core to itself.
 """
 
 from __future__ import annotations
@@ -25,10 +26,11 @@ from mgpo_jax.optimizers import PromptOptimizer, SearchSpace
 from mgpo_jax.policy import Policy, transformer_policy
 from mgpo_jax.prompts import single_goal
 from mgpo_jax.sharding import AXIS, device_mesh, replicate, split
+from mgpo_jax.transformer import TransformerConfig
 from mgpo_jax.types import Prompt
 
 LANES = "lanes"
-GROUP = 25  # lanes that share a clock, at most
+GROUP_BYTES = 3 << 20  # of key-value caches of lanes that share a clock
 NUM_EVAL_EPISODES = 10  # of an evaluation, where starts or worlds are random
 
 
@@ -46,6 +48,13 @@ class Outcome(NamedTuple):
     """All episodes that were run, searches and evaluations."""
     cpu_seconds: float
     """CPU time of all of them, without compilation."""
+
+
+def lanes_together(config: TransformerConfig) -> int:
+    """How many lanes share a clock."""
+    num_tokens = config.max_prompt_length + 2 * config.horizon - 1
+    floats = 2 * config.num_layers * config.embed_dim * num_tokens
+    return max(1, GROUP_BYTES // (4 * floats))
 
 
 def run_adaptation(
@@ -117,7 +126,7 @@ def run_variants(
     keep_rewarded = env.spec.reward_confirms_goals if keep_rewarded is None else keep_rewarded
     lanes = len(variants) * seeds * num
     on_each = -(-lanes // mesh.devices.size)
-    num_groups = -(-on_each // GROUP)
+    num_groups = -(-on_each // lanes_together(network.config))
     group = -(-on_each // num_groups)
     # Lanes beyond the last variant only fill up the last group.
     padded = mesh.devices.size * num_groups * group

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.base import Environment, EnvSpec
-from experiments.adaptation import GROUP, LANES, run_adaptation
+from experiments.adaptation import LANES, lanes_together, run_adaptation
 from experiments.collect import collect, find_demonstrator
 from experiments.configs import make_env, positive, pretrain_preset
 from experiments.policies import LoadedPolicy, load_network
@@ -163,7 +163,7 @@ def policy_to_bench(env: Environment) -> tuple[LoadedPolicy, str]:
 
 def bench_decode(env: Environment, network: LoadedPolicy, note: str) -> Iterator[Row]:
     """Time of one step of acting against the steps before it, and of a whole episode."""
-    horizon, lanes = env.spec.horizon, GROUP
+    horizon, lanes = env.spec.horizon, lanes_together(network.config)
     policy = transformer_policy(network.config, network.params)
     keys = jax.random.split(jax.random.key(0), lanes)
     tasks = jax.vmap(env.sample_task)(keys)
