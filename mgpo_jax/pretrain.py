@@ -86,7 +86,7 @@ def learning_rate_schedule(config: TrainConfig) -> optax.Schedule:
 
 
 def make_optimizer(
-    config: TrainConfig, unravel: Callable[[Array], Any]
+    config: TrainConfig, unravel: Callable[[Any], Any]
 ) -> optax.GradientTransformation:
     """The optimizer, on weights that are one vector.
 
