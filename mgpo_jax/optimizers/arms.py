@@ -69,7 +69,7 @@ def empty_arms(num_arms: int, num_slots: int, goal_dim: int) -> Arms:
 
 
 def insert_arm(arms: Arms, prompt: Prompt, return_: Float[Array, ""]) -> Arms:
-    """A new arm with history {return_}; in a full table it replaces the worst greedy return."""
+    """A new arm with history {return_}; in a full table it replaces the worst evaluation."""
     worst = jnp.argmin(jnp.where(arms.taken, arms.entry_return, jnp.inf))
     row = jnp.where(arms.size < len(arms.pulls), arms.size, worst)
     return Arms(
