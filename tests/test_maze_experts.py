@@ -175,7 +175,8 @@ def check_never_blind(env, maze, trajectory):
 def astar15():
     """Mazes, goals, trajectories and hindsight returns of A*-4, as a dataset has them."""
     sample_task = demonstrators(MAZE15)["astar4"].sample_task
-    tasks = jax.jit(jax.vmap(sample_task))(jax.random.split(jax.random.key(10), NUM_LANES))
+    keys = jax.random.split(jax.random.key(10), NUM_LANES)
+    tasks = jax.jit(jax.vmap(sample_task))(keys, np.arange(NUM_LANES))
     keys = jax.random.split(jax.random.key(11), NUM_LANES)
     episodes = astar_episodes(keys, tasks, OWN_GOALS)
     trajectory, goals, return_ = jax.tree.map(np.asarray, episodes)
