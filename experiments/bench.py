@@ -14,11 +14,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tyro
 
 from envs.base import Environment, EnvSpec
 from experiments.adaptation import LANES, lanes_together, run_adaptation
@@ -45,6 +46,8 @@ class BenchConfig(Common):
 
     env: str = "maze15"
     """The world: maze15, maze30 or gridworld."""
+    demonstrator: Annotated[str | None, tyro.conf.arg(name="policy")] = None
+    """Whose demonstrations to collect and train on (default: those of the recipe)."""
     quick: bool = False
     """A tenth of the work: shows that it runs, gives rough numbers."""
     episodes: int | None = None
@@ -96,10 +99,10 @@ def sequence_flops(
     return (config.num_layers - 1) * full_layer + last_layer + ends
 
 
-def bench_collect(env: Environment, episodes: int) -> tuple[Dataset, Row]:
-    """Demonstrations for the default recipe."""
-    recipe = pretrain_preset(env.spec.name, "fast")
-    name, demonstrator = find_demonstrator(env, recipe.data.demonstrator)
+def bench_collect(env: Environment, name: str | None, episodes: int) -> tuple[Dataset, Row]:
+    """Demonstrations of ``name``, or those of the default recipe."""
+    recipe = pretrain_preset(env.spec.name, "fast").data
+    name, demonstrator = find_demonstrator(env, name or recipe.demonstrator)
     collect(env, demonstrator, 1, seed=1)  # compiles
     (dataset, _), cpu = cpu_time(lambda: collect(env, demonstrator, episodes, seed=0))
     note = f"{name}, {episodes} kept, task generation included"
@@ -149,15 +152,14 @@ def bench_gradient_step(env: Environment, dataset: Dataset, num_steps: int) -> I
     yield Row("  peak memory", peak, "GB", "of the whole process so far")
 
 
-def policy_to_bench(env: Environment) -> tuple[LoadedPolicy, str]:
+def policy_to_bench(env: Environment, dataset: Dataset) -> tuple[LoadedPolicy, str]:
     """The released policy, or untrained weights where there is none."""
     try:
         return load_network(env, None), "released policy"
     except UsageError:
         fast = pretrain_preset(env.spec.name, "fast")
         config = configured_network(fast, env)
-        blank = collect(env, find_demonstrator(env, None)[1], 4, seed=0)[0]
-        params = make_trainer(fast.train, config, blank, device_mesh(1)).init().params
+        params = make_trainer(fast.train, config, dataset, device_mesh(1)).init().params
         return LoadedPolicy(config, params, {}), "untrained policy"
 
 
@@ -251,11 +253,11 @@ def main(config: BenchConfig) -> None:
         print(f"{row.name:<18} {row.value:>10.3f} {row.unit:<18} {row.note}", flush=True)
 
     show(Row("matrix product", matrix_product_rate(), "GFLOP / CPU-s", "2048 x 2048, float32"))
-    dataset, row = bench_collect(env, episodes)
+    dataset, row = bench_collect(env, config.demonstrator, episodes)
     show(row)
     for row in bench_gradient_step(env, dataset, 16 if config.quick else 64):
         show(row)
-    network, note = policy_to_bench(env)
+    network, note = policy_to_bench(env, dataset)
     for row in bench_decode(env, network, note):
         show(row)
     show(bench_adaptation(env, network, note, 50, 20 if config.quick else 100))

@@ -1,0 +1,50 @@
+"""The bench counts the work that the network does, and its command runs to the end."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.bench import BenchConfig, main, sequence_flops
+from mgpo_jax.transformer import TransformerConfig
+
+CONFIG = TransformerConfig(obs_dim=3, goal_dim=2, action_dim=4, horizon=9, embed_dim=8)
+
+
+def products(num_goals: int, num_steps: int) -> int:
+    """FLOP of one pass, product by product (2 m n for a vector of m with a matrix m x n)."""
+    width = CONFIG.embed_dim
+    square = 2 * width * width
+    is_obs = [False] * num_goals + [index % 2 == 0 for index in range(2 * num_steps - 1)]
+    total = 0
+    for layer in range(CONFIG.num_layers):
+        for position, read_out in enumerate(is_obs):
+            total += 2 * square  # key, value
+            if read_out or layer < CONFIG.num_layers - 1:
+                total += 2 * square  # query and mix
+                total += 2 * (4 * square)  # feed-forward
+                total += 2 * (2 * width * (position + 1))  # scores and weighted values
+    embed = 2 * width * (CONFIG.obs_dim + CONFIG.action_dim)
+    return total + num_steps * (embed + 2 * width * CONFIG.action_dim)
+
+
+@pytest.mark.parametrize(("num_goals", "num_steps"), [(1, 1), (3, 1), (1, 4), (5, 9)])
+def test_flops_are_those_of_the_products(num_goals: int, num_steps: int) -> None:
+    counted = sequence_flops(CONFIG, num_goals, np.array([num_steps, num_steps]))
+    assert counted.tolist() == [products(num_goals, num_steps)] * 2
+
+
+@pytest.mark.slow
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "bench.json"
+    main(BenchConfig(demonstrator="astar2", quick=True, episodes=200, json=path))
+    rows = json.loads(path.read_text())["rows"]
+    found = {row["name"].strip(): row for row in rows}
+    assert found["collection"]["note"].startswith("astar2")
+    assert all(row["value"] > 0 for row in rows)
+    assert found["share of it"]["value"] < 100
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in found)
