@@ -70,9 +70,9 @@ class AdaptConfig(Common):
     eval_episodes: int | None = None
     """Greedy episodes that an evaluation averages (default: 1 where task and actions determine an
     episode, else 10)."""
-    keep_rewarded: bool | None = None
-    """UCB, BPE, explore: new prompts keep the goals of the best trajectory that were rewarded (default:
-    in worlds that reward a sequence part by part) [False]."""
+    keep_rewarded: bool = True
+    """UCB, BPE, explore: in worlds that reward a sequence part by part, new prompts keep the goals of the
+    best trajectory that were rewarded [False]."""
     out: Path | None = None
     """Result folder (default: runs/adapt/ENV/BANDIT-seedSEED)."""
     figures: bool = True

@@ -69,7 +69,7 @@ def run_adaptation(
     max_goals: int | None = None,
     eval_every: int = 10,
     eval_episodes: int | None = None,
-    keep_rewarded: bool | None = None,
+    keep_rewarded: bool = True,
 ) -> Outcome:
     """Adapt to every task with every seed; ``make_optimizer(space)`` makes the optimizer."""
     variant = {} if max_goals is None else {"max_goals": max_goals}
@@ -101,7 +101,7 @@ def run_variants(
     seed: int = 0,
     eval_every: int = 10,
     eval_episodes: int | None = None,
-    keep_rewarded: bool | None = None,
+    keep_rewarded: bool = True,
 ) -> list[Outcome]:
     """One outcome for each variant of the optimizer; all see the same tasks and random keys.
 
@@ -118,12 +118,12 @@ def run_variants(
       eval_every: episodes between evaluations of the best prompt.
       eval_episodes: greedy episodes that an evaluation averages (default: 1 in deterministic worlds,
         else ``NUM_EVAL_EPISODES``).
-      keep_rewarded: whether bandits keep the rewarded goals of the best trajectory (default: where
-        ``EnvSpec.reward_confirms_goals``).
+      keep_rewarded: whether bandits keep the rewarded goals of the best trajectory where
+        ``EnvSpec.reward_confirms_goals``.
     """
     num, mesh = num_tasks(tasks), device_mesh()
     eval_episodes = eval_episodes or (1 if env.spec.deterministic else NUM_EVAL_EPISODES)
-    keep_rewarded = env.spec.reward_confirms_goals if keep_rewarded is None else keep_rewarded
+    keep_rewarded = keep_rewarded and env.spec.reward_confirms_goals
     lanes = len(variants) * seeds * num
     on_each = -(-lanes // mesh.devices.size)
     num_groups = -(-on_each // lanes_together(network.config))
