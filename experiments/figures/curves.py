@@ -21,7 +21,7 @@ def learning_curve(results: Mapping[str, Results], title: str | None = None) -> 
 
     Lines are means over tasks and seeds, bands the standard deviation over seeds.
     """
-    figure = Figure(figsize=(3.6, 2.7), layout="constrained")
+    figure = Figure(figsize=(4.8, 2.7), layout="constrained")
     ax = figure.add_subplot()
     for label, (name, color, line, marker) in method_styles(results).items():
         result = results[label]
@@ -37,11 +37,11 @@ def learning_curve(results: Mapping[str, Results], title: str | None = None) -> 
     optima = {round(float(result.optimal_returns.mean()), 6) for result in results.values()}
     for index, optimum in enumerate(sorted(optima)):
         label = "_" if index else "optimum"
-        ax.axhline(optimum, color=INK, linestyle=(0, (4, 3)), linewidth=1.0, label=label, zorder=1)
+        ax.axhline(optimum, color=INK, linestyle=(0, (4, 3)), linewidth=1.0, label=label, zorder=1.8)
     ax.set(xlabel="episodes", ylabel="return of the optimized prompt", title=title or "")
     ax.set_xlim(left=0)
     ax.margins(y=0.08)
-    ax.legend(loc="best")
+    figure.legend(loc="outside right upper")
     return figure
 
 

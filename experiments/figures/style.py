@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from functools import wraps
+from itertools import cycle
 from typing import Any, ParamSpec
 
 import matplotlib as mpl
@@ -41,8 +42,13 @@ METHODS = {
     "grips": ("GRIPS", "#CC79A7", "--", "D"),
     "bbt": ("BBT", "#56B4E9", "--", "v"),
 }
-SPARE_COLORS = ("#E69F00", "#6B6B6B", "#8C510A", "#5E3C99", "#B2182B", "#003C30")
-
+# For labels that are no methods: all colors with solid lines, then all with dashed ones.
+SPARE_COLORS = ("#E69F00", "#6B6B6B", "#8C510A", "#5E3C99", "#B2182B", "#003C30", "#35978F")
+SPARE_STYLES = [
+    (color, line, marker)
+    for line in ("-", "--")
+    for color, marker in zip(SPARE_COLORS, "os^DvPX", strict=True)
+]
 
 Args = ParamSpec("Args")
 
@@ -62,11 +68,12 @@ def method_styles(labels: Iterable[str]) -> dict[str, tuple[str, str, Any, str]]
     """(legend, color, line style, marker) of each label, a method's name or "name (remark)"."""
     styles: dict[str, tuple[str, str, Any, str]] = {}
     taken: set[str] = set()
-    spare = iter(SPARE_COLORS * 10)
+    spare = cycle(SPARE_STYLES)
     for label in labels:
         method, _, remark = label.partition(" ")
-        name, color, line, marker = METHODS.get(method, (method, "", "-", "o"))
-        color = next(spare) if color in taken or not color else color
+        name, color, line, marker = METHODS.get(method, (method, "", "", ""))
+        if color in taken or not color:
+            color, line, marker = next(spare)
         taken.add(color)
         styles[label] = (f"{name} {remark}".strip(), color, line, marker)
     return styles
