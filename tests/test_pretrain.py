@@ -220,8 +220,8 @@ def test_schedules(schedule):
 
 
 def test_a_run_shorter_than_its_warm_up_still_reaches_the_peak():
-    rate = learning_rate_schedule(TrainConfig(steps=10, warmup_steps=300, schedule="constant"))
-    assert float(rate(10)) == pytest.approx(1e-3)
+    config = TrainConfig(steps=10, learning_rate=2e-3, warmup_steps=300, schedule="constant")
+    assert float(learning_rate_schedule(config)(10)) == pytest.approx(2e-3)
 
 
 def test_devices_must_divide_the_parts():

@@ -37,7 +37,9 @@ def learning_curve(results: Mapping[str, Results], title: str | None = None) -> 
     optima = {round(float(result.optimal_returns.mean()), 6) for result in results.values()}
     for index, optimum in enumerate(sorted(optima)):
         label = "_" if index else "optimum"
-        ax.axhline(optimum, color=INK, linestyle=(0, (4, 3)), linewidth=1.0, label=label, zorder=1.8)
+        ax.axhline(
+            optimum, color=INK, linestyle=(0, (4, 3)), linewidth=1.0, label=label, zorder=1.8
+        )
     ax.set(xlabel="episodes", ylabel="return of the optimized prompt", title=title or "")
     ax.set_xlim(left=0)
     ax.margins(y=0.08)
