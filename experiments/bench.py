@@ -21,7 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from envs.base import Environment, EnvSpec
+from envs.base import Environment
+from envs.wrapper import Wrapper
 from experiments.adaptation import LANES, lanes_together, run_adaptation
 from experiments.collect import collect, find_demonstrator
 from experiments.configs import make_env, positive, pretrain_preset
@@ -193,7 +194,7 @@ def bench_decode(env: Environment, network: LoadedPolicy, note: str) -> Iterator
         cost = 1e3 * cpu / lanes / num_steps
         yield Row(f"decode at {position}", cost, "CPU-ms / step", f"{lanes} episodes at once")
 
-    endless: Any = Endless(env)
+    endless = Endless(env)
 
     @jax.jit
     def episodes(keys: Any) -> Any:
@@ -209,15 +210,8 @@ def bench_decode(env: Environment, network: LoadedPolicy, note: str) -> Iterator
     yield Row("full episode", cpu / lanes, "CPU-s", f"{note}, all {mean:.0f} steps of the horizon")
 
 
-@dataclass(frozen=True)
-class Endless:
+class Endless(Wrapper):
     """A world whose episodes last to the horizon."""
-
-    env: Environment
-
-    @property
-    def spec(self) -> EnvSpec:
-        return self.env.spec
 
     def reset(self, key: Any, task: Any) -> Any:
         (state, timestep) = self.env.reset(key, task)
