@@ -1,8 +1,8 @@
 """Many adaptations in one compiled program: every variant, seed and task is a lane of its own.
 
 Lanes are spread over the devices and, on each, run in groups: the lanes of a group share one clock, so
-that a group's episode ends with its slowest lane. Groups are as large as their key-value caches fit into
-the memory near a core; an episode of 500 steps has its core to itself.
+that a group's episode ends with its slowest lane. On a CPU, groups are as large as their key-value caches
+fit into the memory near a core; an episode of 500 steps has its core to itself.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ from mgpo_jax.transformer import TransformerConfig
 from mgpo_jax.types import Prompt
 
 LANES = "lanes"
-GROUP_BYTES = 3 << 20  # of key-value caches of lanes that share a clock
+# Of key-value caches of lanes that share a clock: near a core of a CPU, in the memory of an accelerator.
+GROUP_BYTES, GROUP_BYTES_ACCELERATOR = 3 << 20, 4 << 30
 NUM_EVAL_EPISODES = 10  # of an evaluation, where starts or worlds are random
 
 
@@ -54,7 +55,8 @@ def lanes_together(config: TransformerConfig) -> int:
     """How many lanes share a clock."""
     num_tokens = config.max_prompt_length + 2 * config.horizon - 1
     floats = 2 * config.num_layers * config.embed_dim * num_tokens
-    return max(1, GROUP_BYTES // (4 * floats))
+    limit = GROUP_BYTES if jax.default_backend() == "cpu" else GROUP_BYTES_ACCELERATOR
+    return max(1, limit // (4 * floats))
 
 
 def run_adaptation(
