@@ -11,16 +11,30 @@ from envs.maze_runner import MazeRunner
 
 __all__ = ["ENVIRONMENTS", "EnvSpec", "Environment", "TimeStep", "make"]
 
+
+def _kitchen() -> Environment:
+    from envs.kitchen import Kitchen, check_extra
+
+    check_extra()
+    return Kitchen(name="kitchen", horizon=500)
+
+
 # The paper's sizes 15 and 30; walls lie on even cells, so a side is odd: 15 and 31.
 ENVIRONMENTS: dict[str, Callable[[], Environment]] = {
     "maze15": lambda: MazeRunner(name="maze15", side=15, horizon=64),
     "maze30": lambda: MazeRunner(name="maze30", side=31, horizon=500),
     "gridworld": lambda: GridWorld(name="gridworld", horizon=90),
+    "kitchen": _kitchen,
 }
 
 
 def make(name: str) -> Environment:
-    """The world of that name; ``ValueError`` with the nearest name for one that does not exist."""
+    """The world of that name.
+
+    Raises:
+      ValueError: with the nearest name, for one that does not exist.
+      ImportError: for a world whose optional packages are missing, with the command that installs them.
+    """
     if name not in ENVIRONMENTS:
         near = difflib.get_close_matches(name, ENVIRONMENTS, n=1)
         hint = f"; did you mean {near[0]!r}?" if near else ""

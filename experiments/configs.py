@@ -32,7 +32,7 @@ def make_env(name: str) -> Environment:
     """``envs.make`` with the error of a command line."""
     try:
         return envs.make(name)
-    except ValueError as error:
+    except (ImportError, ValueError) as error:
         raise UsageError(str(error)) from None
 
 

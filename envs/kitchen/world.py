@@ -1,0 +1,276 @@
+"""The kitchen: complete subtasks in an order that the task goal does not tell.
+
+Paper, section 4.1 and appendix C.2. The scene, its 59 numbers of observation, the 9 velocity actions
+and what counts as a completed subtask are those of gymnasium-robotics' FrankaKitchen without observation
+noise, as in the authors' code; so is the rule of the reward: 1/n when the next subtask of the task is
+complete and no later one is. Whatever was completed once stays completed, also when its joint moves back,
+so a later subtask that comes too early ends all reward. The task goal names the set of subtasks; a goal
+is the one subtask that was just completed.
+
+Observation: 9 positions and 9 velocities of arm and fingers, 21 positions and 20 velocities of the
+objects (rad, m, rad/s, m/s). An action in [-1, 1] moves the targets of the joint actuators to at most
+0.16 rad or m from where the joints are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from itertools import permutations
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from envs.base import EnvSpec, TimeStep
+from envs.kitchen.physics import (
+    BACKENDS,
+    Physics,
+    PhysicsState,
+    load_physics,
+    resolve_backend,
+)
+
+SUBTASKS = ("bottom burner", "light switch", "slide cabinet", "hinge cabinet", "microwave")
+NUM_SUBTASKS = len(SUBTASKS)
+NONE = -1  # fills an order of fewer than 5 subtasks
+
+# Positions of the full scene that a subtask is about, and where they should be (gymnasium-robotics,
+# OBS_ELEMENT_INDICES and OBS_ELEMENT_GOALS).
+TARGETS = (
+    {11: -0.88, 12: -0.01},
+    {17: -0.69, 18: -0.05},
+    {19: 0.37},
+    {20: 0.0, 21: 1.45},
+    {22: -0.75},
+)
+THRESHOLD = 0.3
+NUM_POSITIONS, NUM_ROBOT, OBS_DIM = 30, 9, 59
+
+MAX_SHIFT = 2.0 * 0.08  # action scale times control period (FrankaRobot: act_rng, dt)
+# Bounds of the position targets (franka_config.xml), rad and m.
+TARGET_LOW = (-2.9, -1.8, -2.9, -3.1, -2.9, 0.0, -2.9, 0.0, 0.0)
+TARGET_HIGH = (2.9, 1.8, 2.9, 0.0, 2.9, 3.8, 2.9, 0.04, 0.04)
+MAX_SPEED = 1e3  # of any joint; physics beyond has diverged
+
+
+class KitchenTask(NamedTuple):
+    """Which subtasks to complete, and in which order."""
+
+    order: Int[Array, "*batch S"]
+    """Indices into ``SUBTASKS``, then ``NONE`` up to 5 places."""
+
+
+class KitchenState(NamedTuple):
+    """An episode in progress."""
+
+    task: KitchenTask
+    physics: PhysicsState
+    completed: Bool[Array, "S"]
+    """Subtasks that have been completed at least once."""
+    newly: Bool[Array, "S"]
+    """The subtask that the last step completed for the first time, if it did."""
+    num_solved: Int[Array, ""]
+    """Subtasks completed in order."""
+    steps: Int[Array, ""]
+    failed: Bool[Array, ""]
+    """Whether physics diverged or an action was not finite; ``physics`` is from before that step."""
+    done: Bool[Array, ""]
+
+
+@dataclass(frozen=True)
+class Kitchen:
+    """The kitchen world.
+
+    Attributes:
+      name: the name ``envs.make`` knows it by.
+      horizon: steps after which an episode is truncated (paper: 500).
+      backend: ``native`` (C MuJoCo on threads), ``mjx`` (JAX), or ``auto``: MJX on accelerators.
+      model: ``reduced``, or ``stock`` for the scene of gymnasium-robotics as it is (native only).
+    """
+
+    name: str
+    horizon: int
+    backend: str = "auto"
+    model: str = "reduced"
+
+    def __post_init__(self) -> None:
+        if self.backend not in BACKENDS:
+            raise ValueError(
+                f"backend must be one of {', '.join(BACKENDS)}, found {self.backend!r}"
+            )
+        if self.model not in ("reduced", "stock"):
+            raise ValueError(f"model must be reduced or stock, found {self.model!r}")
+        if self.backend == "mjx" and self.model == "stock":
+            raise ValueError(
+                "MJX has no collisions of cylinders with meshes and boxes, which the stock model "
+                "needs: use backend native"
+            )
+
+    @property
+    def spec(self) -> EnvSpec:
+        return EnvSpec(
+            name=self.name,
+            obs_dim=OBS_DIM,
+            goal_dim=NUM_SUBTASKS,
+            action_dim=NUM_ROBOT,
+            discrete=False,
+            horizon=self.horizon,
+            return_range=(0.0, 1.0),
+            truncate_in_hindsight=False,
+            deterministic=True,
+            reward_confirms_goals=True,
+        )
+
+    @property
+    def physics(self) -> Physics:
+        return load_physics(resolve_backend(self.backend, self.model), self.model)
+
+    @property
+    def num_tasks(self) -> int:
+        return len(_all_orders())
+
+    def sample_task(self, key: PRNGKeyArray) -> KitchenTask:
+        """One of the 325 ordered tasks, uniformly (so most have 4 or 5 subtasks)."""
+        return self.task(jax.random.randint(key, (), 0, self.num_tasks))
+
+    def task(self, index: Int[Array, ""]) -> KitchenTask:
+        """The tasks in a fixed order, over and over again: shorter ones first."""
+        return KitchenTask(jnp.asarray(_all_orders())[index % self.num_tasks])
+
+    def sample_goal(self, key: PRNGKeyArray) -> Float[Array, "G"]:
+        return jax.nn.one_hot(jax.random.randint(key, (), 0, NUM_SUBTASKS), NUM_SUBTASKS)
+
+    def task_goal(self, task: KitchenTask) -> Float[Array, "G"]:
+        """The set of subtasks as a multi-hot vector; their order stays hidden."""
+        return jax.nn.one_hot(task.order, NUM_SUBTASKS).sum(axis=0)
+
+    def optimal_return(self, task: KitchenTask) -> Float[Array, ""]:
+        """1: every order fits into the horizon."""
+        del task
+        return jnp.ones(())
+
+    def fingerprint(self, task: KitchenTask) -> Int[Array, "F"]:
+        """The order: a test order must not occur in training."""
+        return task.order
+
+    def check_task(self, task: KitchenTask) -> None:
+        order = np.asarray(task.order)
+        if order.ndim != 2 or order.shape[1] != NUM_SUBTASKS:
+            raise ValueError(
+                f"order must have shape [N, {NUM_SUBTASKS}] (filled up with {NONE}), "
+                f"found {list(order.shape)}"
+            )
+        if not np.issubdtype(order.dtype, np.integer):
+            raise ValueError(f"order must hold integers, found {order.dtype}")
+        if order.min() < NONE or order.max() >= NUM_SUBTASKS:
+            raise ValueError(
+                f"order must hold subtasks 0..{NUM_SUBTASKS - 1}, or {NONE} at the end"
+            )
+        for index, row in enumerate(order):
+            subtasks = row[row != NONE]
+            if len(subtasks) == 0:
+                raise ValueError(f"task {index}: no subtasks")
+            if (row[: len(subtasks)] == NONE).any():
+                raise ValueError(f"task {index}: {NONE} may only fill the end of an order")
+            if len(np.unique(subtasks)) < len(subtasks):
+                raise ValueError(f"task {index}: a subtask occurs twice in {subtasks.tolist()}")
+
+    def reset(self, key: PRNGKeyArray, task: KitchenTask) -> tuple[KitchenState, TimeStep]:
+        """The arm in front of the closed kitchen, always at the same place."""
+        del key
+        nothing = jnp.zeros(NUM_SUBTASKS, bool)
+        zero, running = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+        physics = jax.tree.map(jnp.asarray, self.physics.initial)
+        state = KitchenState(task, physics, nothing, nothing, zero, zero, running, running)
+        return state, self._observe(state, jnp.zeros(()), running)
+
+    def step(self, state: KitchenState, action: Float[Array, "9"]) -> tuple[KitchenState, TimeStep]:
+        valid = jnp.all(jnp.isfinite(action))
+        shift = MAX_SHIFT * jnp.clip(jnp.where(valid, action, 0.0), -1.0, 1.0)
+        ctrl = jnp.clip(
+            state.physics.qpos[:NUM_ROBOT] + shift, jnp.array(TARGET_LOW), jnp.array(TARGET_HIGH)
+        )
+        physics = self.physics.advance(state.physics, ctrl, valid & ~state.done)
+        failed = ~valid | ~_is_sane(physics)
+        physics = jax.tree.map(lambda old, new: jnp.where(failed, old, new), state.physics, physics)
+
+        # One subtask a step, so that goals are single ones; another would count a step later.
+        arrived = self._at_target(physics) & ~state.completed & ~failed
+        newly = arrived & (jnp.cumsum(arrived) == 1)
+        completed = state.completed | newly
+        order, num_solved = state.task.order, state.num_solved
+        num_subtasks = jnp.sum(order != NONE)
+        place = jnp.arange(NUM_SUBTASKS)
+        # Complete: those solved and the next one; not complete: all later ones of the task.
+        in_order = jnp.all((completed[order] == (place <= num_solved)) | (place >= num_subtasks))
+        num_solved += in_order
+        steps = state.steps + 1
+        after = KitchenState(
+            task=state.task,
+            physics=physics,
+            completed=completed,
+            newly=newly,
+            num_solved=num_solved,
+            steps=steps,
+            failed=failed,
+            done=(num_solved >= num_subtasks) | (steps >= self.horizon) | failed,
+        )
+        after = jax.tree.map(lambda old, new: jnp.where(state.done, old, new), state, after)
+        reward = jnp.where(in_order & ~state.done, 1.0 / num_subtasks, 0.0)
+        return after, self._observe(after, reward, after.num_solved >= num_subtasks)
+
+    def _at_target(self, physics: PhysicsState) -> Bool[Array, "S"]:
+        """Which subtasks' joints are within the threshold of their targets."""
+        counts, targets = _target_table()
+        positions = self.physics.positions.expand(physics.qpos)
+        distance = jnp.sqrt(jnp.sum(jnp.where(counts, positions - targets, 0.0) ** 2, axis=1))
+        return distance < THRESHOLD
+
+    def _observe(
+        self, state: KitchenState, reward: Float[Array, ""], complete: Bool[Array, ""]
+    ) -> TimeStep:
+        positions = self.physics.positions.expand(state.physics.qpos)
+        velocities = self.physics.velocities.expand(state.physics.qvel)
+        robot, objects = slice(NUM_ROBOT), slice(NUM_ROBOT, None)
+        return TimeStep(
+            obs=jnp.concatenate(
+                [positions[robot], velocities[robot], positions[objects], velocities[objects]]
+            ),
+            goal=state.newly.astype(jnp.float32),
+            goal_reached=jnp.any(state.newly),
+            outcome=state.completed.astype(jnp.float32),
+            reward=reward,
+            terminated=complete,
+            truncated=((state.steps >= self.horizon) | state.failed) & ~complete,
+        )
+
+
+def _is_sane(physics: PhysicsState) -> Bool[Array, ""]:
+    """Whether a step of physics gave finite numbers of a credible size."""
+    finite = [jnp.all(jnp.isfinite(leaf)) for leaf in physics]
+    return jnp.all(jnp.stack(finite)) & jnp.all(jnp.abs(physics.qvel) < MAX_SPEED)
+
+
+@cache
+def _target_table() -> tuple[np.ndarray, np.ndarray]:
+    """Which of the 30 positions count for each subtask, and their targets, ``[5, 30]`` each."""
+    counts = np.zeros((NUM_SUBTASKS, NUM_POSITIONS), bool)
+    targets = np.zeros((NUM_SUBTASKS, NUM_POSITIONS), np.float32)
+    for subtask, joints in enumerate(TARGETS):
+        for index, target in joints.items():
+            counts[subtask, index], targets[subtask, index] = True, target
+    return counts, targets
+
+
+@cache
+def _all_orders() -> np.ndarray:
+    """All ordered tasks of 1 to 5 distinct subtasks, ``[325, 5]``."""
+    rows = [
+        order + (NONE,) * (NUM_SUBTASKS - length)
+        for length in range(1, NUM_SUBTASKS + 1)
+        for order in permutations(range(NUM_SUBTASKS), length)
+    ]
+    return np.array(rows, np.int32)
