@@ -1,7 +1,8 @@
 """How true the kitchen's physics is: ``python -m experiments.fidelity``.
 
-Three comparisons over random actions: our world on the stock model with gymnasium-robotics' FrankaKitchen,
-the reduced model with the stock model, and MJX with C MuJoCo.
+Over random actions: our world on the stock model with gymnasium-robotics' FrankaKitchen, the reduced model
+with the stock model, and MJX with C MuJoCo. Over demonstrations: what the demonstrator completes on either
+model, and whether FrankaKitchen, given the actions of those on the stock model, completes the same.
 """
 
 from __future__ import annotations
@@ -15,12 +16,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from envs.experts import demonstrators
 from envs.kitchen import SUBTASKS, Kitchen, check_extra
 from experiments.configs import positive
 from experiments.runtime import Common, run
 from mgpo_jax.errors import UsageError
+from mgpo_jax.rollout import run_episode
+from mgpo_jax.types import Episode
 
 ARM, OBJECTS = slice(0, 7), slice(18, 32)
+NUM_LONGEST = 120  # tasks of all five subtasks, the last in the enumeration
+LANES = "lanes"
 
 
 @dataclass(frozen=True)
@@ -33,6 +39,8 @@ class FidelityConfig(Common):
     """Control steps of each."""
     mjx: bool = True
     """Compare MJX too (compiles for half a minute on a CPU)."""
+    demonstrations: int = 8
+    """Demonstrations of all five subtasks on each model."""
 
 
 def gymnasium_kitchen() -> Any:
@@ -104,9 +112,45 @@ def comparisons(config: FidelityConfig) -> Iterator[tuple[str, Float[np.ndarray,
         yield "MJX against C, reduced", backend_errors(config.worlds, config.steps)
 
 
+def demonstrate(env: Kitchen, num: int) -> Episode:
+    """Demonstrations of all five subtasks, in as many orders."""
+    agent = demonstrators(env)["expert"].agent
+    order = np.random.default_rng(0).permutation(NUM_LONGEST)[np.arange(num) % NUM_LONGEST]
+    tasks = jax.vmap(env.task)(jnp.asarray(env.num_tasks - 1 - order))
+
+    def episode(key: jax.Array, task: Any) -> Episode:
+        return run_episode(key, env, agent, task, LANES)
+
+    keys = jax.random.split(jax.random.key(0), num)
+    done = jax.jit(jax.vmap(episode, axis_name=LANES))(keys, tasks)
+    return jax.tree.map(np.asarray, done)
+
+
+def replay(episodes: Episode) -> Iterator[tuple[list[str], list[str], float]]:
+    """FrankaKitchen under recorded actions.
+
+    Yields, for each episode, what it completed here and there, in order, and the largest difference of
+    a position of arm or objects.
+    """
+    kitchen = gymnasium_kitchen()
+    trajectory = episodes.trajectory
+    for index, length in enumerate(trajectory.length):
+        goals = trajectory.goals[index][trajectory.goal_reached[index]]
+        completed = [SUBTASKS[subtask] for subtask in np.argmax(goals, axis=1)]
+        kitchen.reset(seed=0)
+        error = 0.0
+        for step, action in enumerate(trajectory.actions[index, :length]):
+            theirs, _, _, _, info = kitchen.step(action)
+            if step + 1 < length:
+                ours = trajectory.obs[index, step + 1]
+                shift = np.abs(theirs["observation"] - ours)
+                error = max(error, float(shift[ARM].max()), float(shift[OBJECTS].max()))
+        yield completed, list(info["episode_task_completions"]), error
+
+
 def main(config: FidelityConfig) -> None:
     """Compare the kitchen's models and engines with each other and with FrankaKitchen."""
-    positive(config, "worlds", "steps")
+    positive(config, "worlds", "steps", "demonstrations")
     try:
         check_extra()
     except ImportError as error:
@@ -120,6 +164,23 @@ def main(config: FidelityConfig) -> None:
             cells = [errors[:, time - 1, columns] for time in times]
             text = "".join(f"{np.median(cell):>10.1e}{cell.max():>10.1e}" for cell in cells)
             print(f"{name:<34}{part:<9}{text}", flush=True)
+    for model in ("reduced", "stock"):
+        env = Kitchen("kitchen", 500, "native", model)
+        episodes = demonstrate(env, config.demonstrations)
+        complete = int((episodes.return_ > 0.99).sum())
+        length = episodes.trajectory.length.mean()
+        print(
+            f"demonstrator on the {model} model: {complete} of {config.demonstrations} complete all "
+            f"five in order, {length:.0f} steps on average",
+            flush=True,
+        )
+    outcomes = list(replay(episodes))
+    same = sum(ours == theirs for ours, theirs, _ in outcomes)
+    error = max(error for _, _, error in outcomes)
+    print(
+        f"those on the stock model in FrankaKitchen: {same} of {len(outcomes)} complete the same "
+        f"subtasks in the same order; largest error of a position {error:.1e}"
+    )
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from envs.render.grid import draw_grid, draw_objects, grid_gif
+from envs.render.kitchen import kitchen_frames, kitchen_gif
 from envs.render.marks import spread_apart
 from envs.render.maze import (
     PROMPT_COLOR,
@@ -24,6 +25,8 @@ __all__ = [
     "draw_maze",
     "draw_objects",
     "grid_gif",
+    "kitchen_frames",
+    "kitchen_gif",
     "maze_gif",
     "picture_width",
     "place_goals",
