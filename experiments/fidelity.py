@@ -1,15 +1,16 @@
-"""How true the kitchen's physics is: ``python -m experiments.fidelity``.
+"""How true and how fast the kitchen's physics is: ``python -m experiments.fidelity``.
 
 Over random actions: our world on the stock model with gymnasium-robotics' FrankaKitchen, the reduced model
 with the stock model, and MJX with C MuJoCo. Over demonstrations: what the demonstrator completes on either
-model, and whether FrankaKitchen, given the actions of those on the stock model, completes the same.
+model, and whether FrankaKitchen takes each step of those on the stock model to the same place.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,15 +26,19 @@ from mgpo_jax.rollout import run_episode
 from mgpo_jax.types import Episode
 
 ARM, OBJECTS = slice(0, 7), slice(18, 32)
+POSITIONS, VELOCITIES = np.r_[:9, 18:39], np.r_[9:18, 39:59]
 NUM_LONGEST = 120  # tasks of all five subtasks, the last in the enumeration
 LANES = "lanes"
+GYMNASIUM, STOCK, REDUCED, MJX = (
+    "gymnasium-robotics", "stock model, C", "reduced model, C", "reduced model, MJX"
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class FidelityConfig(Common):
     """Settings of ``experiments.fidelity``."""
 
-    worlds: int = 16
+    worlds: int = 32
     """Episodes of random actions."""
     steps: int = 40
     """Control steps of each."""
@@ -58,8 +63,16 @@ def gymnasium_kitchen() -> Any:
     return KitchenEnv(list(SUBTASKS), object_noise_ratio=0.0, robot_noise_ratio=0.0)
 
 
-def observations(env: Kitchen, actions: Float[np.ndarray, "B T 9"]) -> Float[np.ndarray, "B T 59"]:
-    """What episodes with these actions look like."""
+class Recording(NamedTuple):
+    """What episodes with given actions look like, and what they cost."""
+
+    obs: Float[np.ndarray, "B T 59"]
+    rate: float
+    """Control steps per CPU-second, compilation aside."""
+
+
+def record(env: Kitchen, actions: Float[np.ndarray, "B T 9"]) -> Recording:
+    """Our world."""
     options: dict[str, Any] = {}
     if env.backend == "mjx" and jax.default_backend() == "cpu":
         from envs.kitchen.mjx import CPU_OPTIONS
@@ -70,18 +83,24 @@ def observations(env: Kitchen, actions: Float[np.ndarray, "B T 9"]) -> Float[np.
     def play(rows: jax.Array) -> jax.Array:
         return jax.lax.scan(env.step, state, rows)[1].obs
 
-    return np.asarray(jax.jit(jax.vmap(play), **options)(actions))
+    program = jax.jit(jax.vmap(play), **options)
+    jax.block_until_ready(program(actions))
+    start = time.process_time()
+    obs = np.asarray(program(actions))
+    return Recording(obs, actions[..., 0].size / (time.process_time() - start))
 
 
-def gymnasium_observations(actions: Float[np.ndarray, "B T 9"]) -> Float[np.ndarray, "B T 59"]:
-    """The same from FrankaKitchen."""
+def record_gymnasium(actions: Float[np.ndarray, "B T 9"]) -> Recording:
+    """FrankaKitchen."""
     kitchen = gymnasium_kitchen()
 
     def play(rows: np.ndarray) -> list[np.ndarray]:
         kitchen.reset(seed=0)
         return [kitchen.step(action)[0]["observation"] for action in rows]
 
-    return np.array([play(rows) for rows in actions])
+    start = time.process_time()
+    obs = np.array([play(rows) for rows in actions])
+    return Recording(obs, actions[..., 0].size / (time.process_time() - start))
 
 
 def random_actions(num_worlds: int, num_steps: int) -> Float[np.ndarray, "B T 9"]:
@@ -91,25 +110,17 @@ def random_actions(num_worlds: int, num_steps: int) -> Float[np.ndarray, "B T 9"
     return np.repeat(targets, 5, axis=1)[:, :num_steps]
 
 
-def backend_errors(num_worlds: int, num_steps: int) -> Float[np.ndarray, "B T 59"]:
-    """MJX against C MuJoCo on the reduced model, absolute."""
-    actions = random_actions(num_worlds, num_steps)
-    native, mjx = (
-        observations(Kitchen("kitchen", num_steps, backend), actions)
-        for backend in ("native", "mjx")
-    )
-    return np.abs(mjx - native)
-
-
-def comparisons(config: FidelityConfig) -> Iterator[tuple[str, Float[np.ndarray, "B T 59"]]]:
-    """Names and absolute differences of observations."""
+def recordings(config: FidelityConfig) -> dict[str, Recording]:
+    """All models and engines under the same actions."""
     actions = random_actions(config.worlds, config.steps)
-    stock = observations(Kitchen("stock", config.steps, "native", "stock"), actions)
-    yield "stock against gymnasium-robotics", np.abs(stock - gymnasium_observations(actions))
-    reduced = observations(Kitchen("kitchen", config.steps, "native"), actions)
-    yield "reduced against stock", np.abs(reduced - stock)
+    found = {
+        GYMNASIUM: record_gymnasium(actions),
+        STOCK: record(Kitchen("kitchen", config.steps, "native", "stock"), actions),
+        REDUCED: record(Kitchen("kitchen", config.steps, "native"), actions),
+    }
     if config.mjx:
-        yield "MJX against C, reduced", backend_errors(config.worlds, config.steps)
+        found[MJX] = record(Kitchen("kitchen", config.steps, "mjx"), actions)
+    return found
 
 
 def demonstrate(env: Kitchen, num: int) -> Episode:
@@ -127,23 +138,28 @@ def demonstrate(env: Kitchen, num: int) -> Episode:
 
 
 def replay(episodes: Episode) -> Iterator[tuple[list[str], list[str], float]]:
-    """FrankaKitchen under recorded actions.
+    """FrankaKitchen, taken to each recorded state and given the recorded action.
 
-    Yields, for each episode, what it completed here and there, in order, and the largest difference of
-    a position of arm or objects.
+    In contact the smallest difference grows, so that a replay of actions alone parts after one or two
+    subtasks. Yields, for each episode, what it completed here and there, in order, and the largest
+    difference of a position of arm or objects after a step.
     """
     kitchen = gymnasium_kitchen()
+    robot = kitchen.robot_env
     trajectory = episodes.trajectory
     for index, length in enumerate(trajectory.length):
         goals = trajectory.goals[index][trajectory.goal_reached[index]]
         completed = [SUBTASKS[subtask] for subtask in np.argmax(goals, axis=1)]
         kitchen.reset(seed=0)
         error = 0.0
-        for step, action in enumerate(trajectory.actions[index, :length]):
-            theirs, _, _, _, info = kitchen.step(action)
+        for step in range(length):
+            obs = trajectory.obs[index, step].astype(np.float64)
+            qpos, qvel = obs[POSITIONS], obs[VELOCITIES]
+            robot.set_state(qpos, qvel)
+            robot._last_robot_qpos = qpos[:9]
+            theirs, _, _, _, info = kitchen.step(trajectory.actions[index, step])
             if step + 1 < length:
-                ours = trajectory.obs[index, step + 1]
-                shift = np.abs(theirs["observation"] - ours)
+                shift = np.abs(theirs["observation"] - trajectory.obs[index, step + 1])
                 error = max(error, float(shift[ARM].max()), float(shift[OBJECTS].max()))
         yield completed, list(info["episode_task_completions"]), error
 
@@ -155,15 +171,22 @@ def main(config: FidelityConfig) -> None:
         check_extra()
     except ImportError as error:
         raise UsageError(str(error)) from None
-    times = [time for time in (1, 5, 10, 20, 40, 80) if time <= config.steps]
-    print(f"{config.worlds} episodes, uniform actions held for 5 steps: median and largest error")
-    header = "".join(f"{f'step {time}':>20}" for time in times)
-    print(f"{'':<34}{'':<9}{header}")
-    for name, errors in comparisons(config):
+    found = recordings(config)
+    print(f"{config.worlds} episodes of {config.steps} steps, uniform actions held for 5 steps")
+    for name, recording in found.items():
+        print(f"{name:<24}{recording.rate:>8.0f} control steps / CPU-s")
+    times = [step for step in (1, 5, 10, 20, 40, 80) if step <= config.steps]
+    print("\nmedian and largest difference of positions (rad, m) after so many steps")
+    print(f"{'':<52}" + "".join(f"{step:>18}" for step in times))
+    for first, second in ((STOCK, GYMNASIUM), (REDUCED, STOCK), (MJX, REDUCED)):
+        if first not in found:
+            continue
+        errors = np.abs(found[first].obs - found[second].obs)
         for part, columns in (("arm", ARM), ("objects", OBJECTS)):
-            cells = [errors[:, time - 1, columns] for time in times]
-            text = "".join(f"{np.median(cell):>10.1e}{cell.max():>10.1e}" for cell in cells)
-            print(f"{name:<34}{part:<9}{text}", flush=True)
+            cells = [errors[:, step - 1, columns] for step in times]
+            text = "".join(f"{np.median(cell):>9.0e}{cell.max():>9.0e}" for cell in cells)
+            print(f"{f'{first}, {second}':<44}{part:<8}{text}")
+    print(flush=True)
     for model in ("reduced", "stock"):
         env = Kitchen("kitchen", 500, "native", model)
         episodes = demonstrate(env, config.demonstrations)
@@ -178,8 +201,8 @@ def main(config: FidelityConfig) -> None:
     same = sum(ours == theirs for ours, theirs, _ in outcomes)
     error = max(error for _, _, error in outcomes)
     print(
-        f"those on the stock model in FrankaKitchen: {same} of {len(outcomes)} complete the same "
-        f"subtasks in the same order; largest error of a position {error:.1e}"
+        f"their steps in FrankaKitchen: {same} of {len(outcomes)} complete the same subtasks in the "
+        f"same order; largest error of a position {error:.1e}"
     )
 
 
