@@ -33,6 +33,7 @@ class EnvSpec:
         only a sample of what a prompt is worth.
       reward_confirms_goals: whether a reward at a goal says that this goal was the right one at this
         point, as where a sequence is rewarded part by part.
+      num_test_tasks: tasks kept for test.
     """
 
     name: str
@@ -45,6 +46,7 @@ class EnvSpec:
     truncate_in_hindsight: bool
     deterministic: bool
     reward_confirms_goals: bool
+    num_test_tasks: int = 50
 
 
 class TimeStep(NamedTuple):

@@ -16,7 +16,6 @@ from mgpo_jax.errors import DataError, UsageError
 
 # Streams of task seeds that never meet: test, evaluation while training; data seeds count from 0.
 TEST_SEED, EVAL_SEED = 1_000_003, 1_000_033
-NUM_TEST_TASKS = 50
 
 
 def sample_tasks(env: Environment, seed: int, num: int) -> Task:
@@ -29,8 +28,9 @@ def _task_sampler(env: Environment) -> Any:
     return jax.jit(jax.vmap(env.sample_task))
 
 
-def benchmark_tasks(env: Environment, num: int = NUM_TEST_TASKS) -> Task:
+def benchmark_tasks(env: Environment, num: int | None = None) -> Task:
     """The test tasks of a world, all different: the same for everyone, and in no dataset."""
+    num = num or env.spec.num_test_tasks
     drawn = sample_tasks(env, TEST_SEED, 2 * num)
     rows = [np.asarray(leaf).reshape(2 * num, -1) for leaf in jax.tree.leaves(drawn)]
     _, first = np.unique(np.concatenate(rows, axis=1), axis=0, return_index=True)

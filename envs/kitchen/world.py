@@ -122,6 +122,7 @@ class Kitchen:
             truncate_in_hindsight=False,
             deterministic=True,
             reward_confirms_goals=True,
+            num_test_tasks=25,
         )
 
     @property
