@@ -14,8 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import PartitionSpec
 
 from envs.kitchen import NONE, SUBTASKS, Kitchen, KitchenTask, MissingExtraError, extra
+from mgpo_jax.sharding import device_mesh
 
 mujoco = pytest.importorskip("mujoco")
 pytest.importorskip("mujoco.mjx")
@@ -170,7 +172,7 @@ class TestTasks:
     def test_a_split_of_25_test_tasks_leaves_300(self):
         from experiments.tasks import benchmark_tasks, task_hashes
 
-        tests = set(task_hashes(WORLD, benchmark_tasks(WORLD, 25)).tolist())
+        tests = set(task_hashes(WORLD, benchmark_tasks(WORLD)).tolist())
         everything = jax.vmap(WORLD.task)(jnp.arange(NUM_TASKS))
         assert len(tests) == 25
         assert len(set(task_hashes(WORLD, everything).tolist()) - tests) == 300
@@ -302,6 +304,23 @@ class TestNative:
                 data.ctrl[:] = np.clip(data.qpos[:9] + 0.16 * action, low, high)
                 mujoco.mj_step(model, data, 10)
                 np.testing.assert_allclose(obs[world, step, :9], data.qpos[:9], atol=1e-4)
+
+    @pytest.mark.skipif(jax.device_count() < 2, reason="needs two devices")
+    def test_two_devices(self):
+        """Each runs its own part of the lanes, as in adaptation, and calls at the same time."""
+        spec = PartitionSpec("data")
+        actions = random_actions(4, 24, 30)
+        state = jax.tree.map(jnp.asarray, begin([LIGHT]))
+
+        def play(rows):
+            return jax.vmap(lambda rows: jax.lax.scan(WORLD.step, state, rows)[1].obs)(rows)
+
+        sharded = jax.jit(
+            jax.shard_map(play, mesh=device_mesh(2), in_specs=spec, out_specs=spec, check_vma=False)
+        )
+        expected = np.asarray(jax.jit(play)(actions))
+        for _ in range(3):
+            np.testing.assert_allclose(sharded(actions), expected, atol=1e-5)
 
     def test_threads_share_it(self):
         stepper = WORLD.physics  # loads the model once, before the threads

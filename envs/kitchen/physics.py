@@ -15,6 +15,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from envs.kitchen.extra import check_extra
+
 BACKENDS = ("auto", "native", "mjx")
 
 
@@ -67,7 +69,12 @@ def resolve_backend(backend: str, model: str) -> str:
 
 @cache
 def load_physics(backend: str, model: str) -> Physics:
-    """The engine ``native`` or ``mjx`` with the model ``reduced`` or ``stock``."""
+    """The engine ``native`` or ``mjx`` with the model ``reduced`` or ``stock``.
+
+    Raises:
+      MissingExtraError: if the packages of the kitchen are missing or do not fit together.
+    """
+    check_extra()
     if backend == "native":
         from envs.kitchen.native import native_physics
 
