@@ -12,11 +12,11 @@ from envs.maze_runner import MazeRunner
 __all__ = ["ENVIRONMENTS", "EnvSpec", "Environment", "TimeStep", "make"]
 
 
-def _kitchen() -> Environment:
+def _kitchen(backend: str = "auto", model: str = "reduced") -> Environment:
     from envs.kitchen import Kitchen, check_extra
 
     check_extra()
-    return Kitchen(name="kitchen", horizon=500)
+    return Kitchen(name="kitchen", horizon=500, backend=backend, model=model)
 
 
 # The paper's sizes 15 and 30; walls lie on even cells, so a side is odd: 15 and 31.
@@ -25,6 +25,10 @@ ENVIRONMENTS: dict[str, Callable[[], Environment]] = {
     "maze30": lambda: MazeRunner(name="maze30", side=31, horizon=500),
     "gridworld": lambda: GridWorld(name="gridworld", horizon=90),
     "kitchen": _kitchen,
+    # The same world with the physics chosen by hand: policies, tasks and datasets are those of kitchen.
+    "kitchen-mjx": lambda: _kitchen("mjx"),
+    "kitchen-native": lambda: _kitchen("native"),
+    "kitchen-stock": lambda: _kitchen("native", "stock"),
 }
 
 

@@ -34,6 +34,7 @@ class EnvSpec:
       reward_confirms_goals: whether a reward at a goal says that this goal was the right one at this
         point, as where a sequence is rewarded part by part.
       num_test_tasks: tasks kept for test.
+      compiler_options: XLA options, name and value, that programs holding a step should be compiled with.
     """
 
     name: str
@@ -47,6 +48,7 @@ class EnvSpec:
     deterministic: bool
     reward_confirms_goals: bool
     num_test_tasks: int = 50
+    compiler_options: tuple[tuple[str, bool], ...] = ()
 
 
 class TimeStep(NamedTuple):
@@ -125,7 +127,7 @@ class Demonstrator(NamedTuple):
     sample_task: Callable
     """``(key, index) -> task`` of the index-th demonstration."""
     agent: Agent
-    min_length: int
-    """Demonstrations with fewer steps are dropped."""
+    keeps: Callable
+    """``episode -> bool``; other demonstrations are dropped and tried again."""
     hindsight_return: Callable
     """``trajectory -> return`` on the task that the trajectory happens to solve."""

@@ -49,7 +49,7 @@ class AdaptConfig(Common):
     """Settings of ``experiments.adapt``; values in brackets are the paper's."""
 
     env: str = "maze15"
-    """The world: maze15, maze30 or gridworld."""
+    """The world: maze15, maze30, gridworld or kitchen."""
     bandit: str = "ucb"
     """The prompt optimizer: ucb, bpe, explore, grips or bbt."""
     policy: Path | None = None

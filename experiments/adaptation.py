@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from envs.base import Environment, Task
 from experiments.policies import LoadedPolicy
+from experiments.runtime import jit_with
 from experiments.tasks import num_tasks
 from mgpo_jax.adapt import AdaptLog, continue_adaptation, evaluate, start_adaptation
 from mgpo_jax.optimizers import PromptOptimizer, SearchSpace
@@ -169,7 +170,7 @@ def run_variants(
                 on_device, mesh=mesh, in_specs=in_specs, out_specs=spec, check_vma=False
             )(*args)
 
-        return jax.jit(call)
+        return jit_with(env)(call)
 
     @over_lanes
     def start(key: Any, task: Task, hyper: Any, params: Any) -> Any:

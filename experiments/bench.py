@@ -28,7 +28,7 @@ from experiments.collect import collect, find_demonstrator
 from experiments.configs import make_env, positive, pretrain_preset
 from experiments.policies import LoadedPolicy, load_network
 from experiments.pretrain import configured_network
-from experiments.runtime import Common, provenance, run, write_json
+from experiments.runtime import Common, jit_with, provenance, run, write_json
 from experiments.tasks import benchmark_tasks
 from mgpo_jax.adapt import evaluate
 from mgpo_jax.dataset import Dataset
@@ -46,7 +46,7 @@ class BenchConfig(Common):
     """Settings of ``experiments.bench``."""
 
     env: str = "maze15"
-    """The world: maze15, maze30 or gridworld."""
+    """The world: maze15, maze30, gridworld or kitchen."""
     demonstrator: Annotated[str | None, tyro.conf.arg(name="policy")] = None
     """Whose demonstrations to collect and train on (default: those of the recipe)."""
     quick: bool = False
@@ -196,7 +196,7 @@ def bench_decode(env: Environment, network: LoadedPolicy, note: str) -> Iterator
 
     endless = Endless(env)
 
-    @jax.jit
+    @jit_with(env)
     def episodes(keys: Any) -> Any:
         run = jax.vmap(
             lambda key, task, prompt: evaluate(key, endless, policy, task, prompt, LANES),

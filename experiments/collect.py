@@ -6,6 +6,7 @@ import sys
 import time
 from dataclasses import dataclass
 from functools import cache, partial
+from itertools import count, islice
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from tqdm import tqdm
 from envs.base import Demonstrator, Environment
 from envs.experts import demonstrators
 from experiments.configs import data_root, make_env, positive
-from experiments.runtime import Common, refuse_existing, run, versions
+from experiments.runtime import Common, jit_with, refuse_existing, run, versions
 from experiments.tasks import benchmark_tasks, task_hashes
 from mgpo_jax.dataset import Dataset, hash_task, save_dataset
 from mgpo_jax.errors import nearest
@@ -59,18 +60,21 @@ def find_demonstrator(env: Environment, policy: str | None) -> tuple[str, Demons
 
 @cache
 def demonstration_program(env: Environment, demonstrator: Demonstrator) -> Any:
-    """``(keys, indices) -> (task fingerprints, trajectories, hindsight returns)``.
+    """``(keys, indices) -> (task fingerprints, trajectories, hindsight returns, which to keep)``.
 
     Compiled once a process.
     """
 
-    @jax.jit
+    @jit_with(env)
     @partial(jax.vmap, axis_name=LANES)
-    def demonstrate(key: jax.Array, index: jax.Array) -> tuple[jax.Array, Trajectory, jax.Array]:
+    def demonstrate(
+        key: jax.Array, index: jax.Array
+    ) -> tuple[jax.Array, Trajectory, jax.Array, jax.Array]:
         key_task, key_episode = jax.random.split(key)
         task = demonstrator.sample_task(key_task, index)
-        trajectory = run_episode(key_episode, env, demonstrator.agent, task, LANES).trajectory
-        return env.fingerprint(task), trajectory, demonstrator.hindsight_return(trajectory)
+        episode = run_episode(key_episode, env, demonstrator.agent, task, LANES)
+        return_ = demonstrator.hindsight_return(episode.trajectory)
+        return env.fingerprint(task), episode.trajectory, return_, demonstrator.keeps(episode)
 
     return demonstrate
 
@@ -78,26 +82,32 @@ def demonstration_program(env: Environment, demonstrator: Demonstrator) -> Any:
 def collect(
     env: Environment, demonstrator: Demonstrator, episodes: int, seed: int
 ) -> tuple[Dataset, dict[str, Any]]:
-    """Demonstrations on random tasks, none of them a test task, and facts about them."""
+    """Demonstrations, none of them of a test task, and facts about them.
+
+    Those that are not worth keeping are tried again with another key, so that a demonstrator that goes
+    through all tasks in turn demonstrates each of them equally often.
+    """
     demonstrate = demonstration_program(env, demonstrator)
     forbidden = task_hashes(env, benchmark_tasks(env))
     kept: list[tuple[Any, ...]] = []
-    num_kept = num_short = num_test = batch = 0
+    num_kept = num_test = batch = 0
+    fresh, again, num_again = count(), np.zeros(0, int), 0
     with tqdm(total=episodes, unit="episode", disable=None) as progress:
         while num_kept < episodes:
             keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), batch), BATCH)
-            indices = batch * BATCH + np.arange(BATCH)
-            prints, trajectory, returns = jax.device_get(demonstrate(keys, indices))
+            new = list(islice(fresh, BATCH - len(again)))
+            indices = np.concatenate([again, new]).astype(np.int32)
+            prints, trajectory, returns, good = jax.device_get(demonstrate(keys, indices))
             hashes = np.array([hash_task(one) for one in prints], np.uint64)
-            long_enough = trajectory.length >= demonstrator.min_length
             unseen = ~np.isin(hashes, forbidden)
-            rows = np.flatnonzero(long_enough & unseen)[: episodes - num_kept]
+            again = indices[unseen & ~good]
+            rows = np.flatnonzero(unseen & good)[: episodes - num_kept]
             real = np.arange(trajectory.goal_reached.shape[1]) < trajectory.length[rows, None]
             steps = [np.asarray(array)[rows][real] for array in trajectory[:-1]]
             kept.append((*steps, trajectory.length[rows], hashes[rows], returns[rows]))
             num_kept += len(rows)
-            num_short += int((~long_enough).sum())
-            num_test += int((long_enough & ~unseen).sum())
+            num_again += len(again)
+            num_test += int((~unseen).sum())
             batch += 1
             progress.update(len(rows))
     *arrays, all_returns = (np.concatenate(parts) for parts in zip(*kept, strict=True))
@@ -105,7 +115,7 @@ def collect(
     if np.isin(dataset.task_hashes, forbidden).any():
         raise AssertionError("a test task is in the dataset")
     facts = {
-        "dropped_short": num_short,
+        "tried_again": num_again,
         "dropped_test_tasks": num_test,
         "length": _describe(dataset.lengths),
         "at_horizon": float(np.mean(dataset.lengths == env.spec.horizon)),

@@ -51,7 +51,7 @@ class DataConfig:
     demonstrator: Annotated[str | None, tyro.conf.arg(name="policy")] = None
     """Who collects it: astar1, astar2, astar4 or random in mazes (default: the world's first)."""
     episodes: int = 10_000
-    """Trajectories kept [10,000 in mazes, 13,600 in gridworld]."""
+    """Trajectories kept [10,000 in mazes, 13,600 in gridworld, 9,000 in kitchen]."""
     data_seed: Annotated[int, tyro.conf.arg(name="data-seed")] = 0
     """Seed of the dataset."""
 
@@ -61,13 +61,13 @@ class PretrainConfig(Common):
     """Settings of ``experiments.pretrain``; values in brackets are the paper's."""
 
     env: str = "maze15"
-    """The world: maze15, maze30 or gridworld."""
+    """The world: maze15, maze30, gridworld or kitchen."""
     preset: str = "fast"
     """Where the defaults below come from: fast, paper or smoke."""
     data: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
     train: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
     max_prompt_length: int = 5
-    """K, the longest prompt [5 in mazes, 8 in gridworld]."""
+    """K, the longest prompt [5 in mazes, 8 in gridworld, 6 in kitchen]."""
     dropout: float = 0.0
     """Dropout rate [0.1]."""
     prompt_order: bool = True
@@ -78,6 +78,10 @@ class PretrainConfig(Common):
     """Transformer blocks [3]."""
     num_heads: int = 4
     """Attention heads [1]."""
+    head: str | None = None
+    """Distribution of continuous actions: gaussian, mixture, binned or fixed_gaussian [fixed_gaussian*]."""
+    standardize_obs: bool = False
+    """Standardize observations by their mean and spread in the dataset [False]."""
     holdout: int = 200
     """Trajectories kept out of training for the validation loss."""
     eval_tasks: int = 64
@@ -114,6 +118,8 @@ class Recipe:
     bucket: int
     demonstrator: str | None = None
     save_every: int = 500
+    head: str | None = None
+    standardize_obs: bool = False
 
 
 # Demonstrations are cheaper than regularization: 10,000 of maze15 are soon overfitted, 100,000 take a
@@ -130,6 +136,15 @@ FAST = {
     ),
     # Each of the 13,600 training tasks five times.
     "gridworld": Recipe(steps=3_000, episodes=68_000, max_prompt_length=8, bucket=8),
+    "kitchen": Recipe(
+        steps=5_000,
+        episodes=9_000,
+        max_prompt_length=6,
+        bucket=32,
+        save_every=250,
+        head="mixture",
+        standardize_obs=True,
+    ),
 }
 
 # Steps of the authors' code; their text gives none.
@@ -137,15 +152,18 @@ PAPER = {
     "maze15": Recipe(steps=50_000, episodes=10_000, max_prompt_length=5, bucket=4),
     "maze30": Recipe(steps=200_000, episodes=10_000, max_prompt_length=5, bucket=32),
     "gridworld": Recipe(steps=50_000, episodes=13_600, max_prompt_length=8, bucket=8),
+    "kitchen": Recipe(
+        steps=200_000, episodes=9_000, max_prompt_length=6, bucket=32, head="fixed_gaussian"
+    ),
 }
 
 
 def pretrain_preset(env: str, preset: str) -> PretrainConfig:
     """The default settings for a world."""
-    make_env(env)  # complains about an unknown name
+    world = make_env(env).spec.name  # complains about an unknown name
     if preset not in PRESETS:
         raise nearest(preset, PRESETS, "preset")
-    recipe = (PAPER if preset == "paper" else FAST)[env]
+    recipe = (PAPER if preset == "paper" else FAST)[world]
     fast = PretrainConfig(
         env=env,
         preset=preset,
@@ -153,6 +171,8 @@ def pretrain_preset(env: str, preset: str) -> PretrainConfig:
         train=TrainConfig(steps=recipe.steps, bucket=recipe.bucket),
         max_prompt_length=recipe.max_prompt_length,
         save_every=recipe.save_every,
+        head=recipe.head,
+        standardize_obs=recipe.standardize_obs,
     )
     if preset == "paper":
         train = replace(

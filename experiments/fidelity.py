@@ -20,7 +20,7 @@ from jaxtyping import Float
 from envs.experts import demonstrators
 from envs.kitchen import SUBTASKS, Kitchen, check_extra
 from experiments.configs import positive
-from experiments.runtime import Common, run
+from experiments.runtime import Common, jit_with, run
 from mgpo_jax.errors import UsageError
 from mgpo_jax.rollout import run_episode
 from mgpo_jax.types import Episode
@@ -73,17 +73,12 @@ class Recording(NamedTuple):
 
 def record(env: Kitchen, actions: Float[np.ndarray, "B T 9"]) -> Recording:
     """Our world."""
-    options: dict[str, Any] = {}
-    if env.backend == "mjx" and jax.default_backend() == "cpu":
-        from envs.kitchen.mjx import CPU_OPTIONS
-
-        options = {"compiler_options": CPU_OPTIONS}
     state, _ = env.reset(jax.random.key(0), env.task(jnp.array(env.num_tasks - 1)))
 
     def play(rows: jax.Array) -> jax.Array:
         return jax.lax.scan(env.step, state, rows)[1].obs
 
-    program = jax.jit(jax.vmap(play), **options)
+    program = jit_with(env)(jax.vmap(play))
     jax.block_until_ready(program(actions))
     start = time.process_time()
     obs = np.asarray(program(actions))
@@ -133,7 +128,7 @@ def demonstrate(env: Kitchen, num: int) -> Episode:
         return run_episode(key, env, agent, task, LANES)
 
     keys = jax.random.split(jax.random.key(0), num)
-    done = jax.jit(jax.vmap(episode, axis_name=LANES))(keys, tasks)
+    done = jit_with(env)(jax.vmap(episode, axis_name=LANES))(keys, tasks)
     return jax.tree.map(np.asarray, done)
 
 

@@ -24,7 +24,7 @@ from envs.base import Environment
 from experiments.collect import CollectConfig, dataset_folder, find_demonstrator
 from experiments.collect import main as collect_main
 from experiments.configs import PretrainConfig, make_env, positive, pretrain_default
-from experiments.runtime import provenance, refuse_existing, run, to_json, write_json
+from experiments.runtime import jit_with, provenance, refuse_existing, run, to_json, write_json
 from experiments.tasks import EVAL_SEED, benchmark_tasks, sample_tasks, task_hashes
 from mgpo_jax.adapt import evaluate
 from mgpo_jax.checkpoint import (
@@ -43,6 +43,7 @@ from mgpo_jax.sharding import device_mesh, largest_divisor
 from mgpo_jax.transformer import TransformerConfig
 
 LANES = "lanes"
+CONSTANT = 1e-4  # standard deviation of an observation's component that does not count as varying
 
 
 class Metrics:
@@ -81,17 +82,27 @@ def _optional(module: str, extra: str) -> Any:
         ) from None
 
 
-def configured_network(config: PretrainConfig, env: Environment) -> TransformerConfig:
+def configured_network(
+    config: PretrainConfig, env: Environment, dataset: Dataset
+) -> TransformerConfig:
     """The network of a run: its settings are those that both configs have."""
     common = {f.name for f in fields(TransformerConfig)} & {f.name for f in fields(PretrainConfig)}
-    return network_config(env.spec, **{name: getattr(config, name) for name in common})
+    network = network_config(env.spec, **{name: getattr(config, name) for name in common})
+    if not config.standardize_obs:
+        return network
+    mean, std = (stat(dataset.obs, axis=0, dtype=np.float64) for stat in (np.mean, np.std))
+    std = np.where(std < CONSTANT, 1.0, std)
+    return replace(network, obs_mean=tuple(mean.tolist()), obs_std=tuple(std.tolist()))
 
 
 def prepare_dataset(config: PretrainConfig, env: Environment) -> Dataset:
     """The run's dataset, collected first where it is not there yet; no test task is in it."""
     policy, _ = find_demonstrator(env, config.data.demonstrator)
     wanted = CollectConfig(
-        env=config.env, policy=policy, episodes=config.data.episodes, seed=config.data.data_seed
+        env=env.spec.name,
+        policy=policy,
+        episodes=config.data.episodes,
+        seed=config.data.data_seed,
     )
     folder = dataset_folder(wanted, policy)
     if not folder.exists():
@@ -114,7 +125,7 @@ def greedy_evaluation(
     tasks = sample_tasks(env, EVAL_SEED, num)
     optimum = jax.jit(jax.vmap(env.optimal_return))(tasks)
 
-    @jax.jit
+    @jit_with(env)
     @partial(jax.vmap, in_axes=(None, 0, 0), axis_name=LANES)
     def returns(params: Any, key: jax.Array, task: Any) -> jax.Array:
         policy = transformer_policy(network, params)
@@ -185,8 +196,8 @@ def main(config: PretrainConfig) -> None:
     if not config.resume:
         refuse_existing(config.folder, "continue it with --resume", "choose another with --out")
     env = make_env(config.env)
-    network = configured_network(config, env)
     dataset = prepare_dataset(config, env)
+    network = configured_network(config, env, dataset)
     folder = open_run(config)
 
     train = config.train

@@ -28,6 +28,7 @@ from typing import Any, NoReturn
 
 import tyro
 
+from envs.base import Environment
 from mgpo_jax.errors import DataError, UsageError
 
 EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
@@ -62,6 +63,13 @@ def configure() -> None:
     default = Path.home() / ".cache" / "mgpo_jax"
     jax.config.update("jax_compilation_cache_dir", os.environ.get("MGPO_CACHE", str(default)))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def jit_with(env: Environment) -> Callable[[Callable], Any]:
+    """``jax.jit`` for programs that hold steps of a world."""
+    import jax
+
+    return jax.jit(compiler_options=dict(env.spec.compiler_options))
 
 
 def run(

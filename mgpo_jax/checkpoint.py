@@ -22,12 +22,14 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 
 from envs.base import EnvSpec
 from mgpo_jax.dataset import hash_file
-from mgpo_jax.errors import DataError, UsageError
+from mgpo_jax.distributions import HEADS
+from mgpo_jax.errors import DataError, UsageError, nearest
 from mgpo_jax.pretrain import TrainState
 from mgpo_jax.prompts import single_goal
 from mgpo_jax.transformer import GoalTransformer, TransformerConfig
 
 FORMAT = 1
+SIZES = ("obs_dim", "goal_dim", "action_dim", "horizon")  # of a world, which its policies share
 WEIGHTS = "weights.npz"
 CONFIG = "config.json"
 
@@ -85,14 +87,22 @@ def restore_state(manager: ocp.CheckpointManager, blank: TrainState) -> TrainSta
     return TrainState(params, opt_state, step)
 
 
-def network_config(spec: EnvSpec, **sizes: Any) -> TransformerConfig:
-    """The network for a world, with Table 6's sizes unless given others."""
+def network_config(spec: EnvSpec, head: str | None = None, **sizes: Any) -> TransformerConfig:
+    """The network for a world, with Table 6's sizes unless given others.
+
+    Raises:
+      UsageError: if there is no such head, or it is not one for the world's actions.
+    """
+    known = [name for name in HEADS if (name == "categorical") == spec.discrete]
+    head = head or known[0]
+    if head not in known:
+        raise nearest(head, known, f"head for {spec.name}")
     return TransformerConfig(
         obs_dim=spec.obs_dim,
         goal_dim=spec.goal_dim,
         action_dim=spec.action_dim,
         horizon=spec.horizon,
-        head="categorical" if spec.discrete else "gaussian",
+        head=head,
         **sizes,
     )
 
@@ -133,13 +143,23 @@ def load_policy_files(
         )
     try:
         document = json.loads((folder / CONFIG).read_text())
-        config = TransformerConfig(**document["network"])
+        network = document["network"]
+        lists = {name: tuple(value) for name, value in network.items() if isinstance(value, list)}
+        config = TransformerConfig(**{**network, **lists})
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(f"{folder / CONFIG} is not the config of a policy ({error})") from None
     if document.get("format") != FORMAT:
         raise DataError(
             f"{folder} has format {document.get('format')}, this version reads {FORMAT}"
         )
+    if config.head not in HEADS:
+        raise DataError(f"{folder / CONFIG} has the unknown head {config.head!r}")
+    for name in ("obs_mean", "obs_std"):
+        values = getattr(config, name)
+        if len(values) not in (0, config.obs_dim) or not np.isfinite(values).all():
+            raise DataError(
+                f"{folder / CONFIG}: {name} must hold {config.obs_dim} finite numbers, or none"
+            )
     path = folder / WEIGHTS
     if not path.is_file() or hash_file(path) != document.get("sha256"):
         raise DataError(f"{path} is missing, truncated or differs from the hash in {CONFIG}")
@@ -161,9 +181,10 @@ def load_policy_files(
         if not np.isfinite(flat[name]).all():
             raise DataError(f"{path}: weight {name} holds NaN or infinity")
     if spec is not None:
-        want_config = network_config(spec)
-        for field in ("obs_dim", "goal_dim", "action_dim", "horizon", "head"):
-            found, want = getattr(config, field), getattr(want_config, field)
+        discrete = config.head == "categorical"
+        facts = {"discrete": discrete, **{name: getattr(config, name) for name in SIZES}}
+        for field, found in facts.items():
+            want = getattr(spec, field)
             if found != want:
                 raise DataError(
                     f"the policy in {folder} has {field} {found}, {spec.name} needs {want}: "

@@ -45,25 +45,81 @@ class Categorical(NamedTuple):
 
 
 class Gaussian(NamedTuple):
-    """Diagonal Gaussian with its mean squashed into (-1, 1) and a learned spread.
+    """Diagonal Gaussian whose actions are clipped to [-1, 1].
 
-    The authors train the mean by squared error and act with a fixed spread of exp(-1); the
-    log-likelihood here is the paper's Eq. 2.
+    The log-likelihood is the paper's Eq. 2. The authors train the mean by squared error and act with a
+    fixed spread of exp(-1), which is the head ``fixed_gaussian``.
     """
 
     mean: Float[Array, "*batch A"]
     log_std: Float[Array, "*batch A"]
 
     def log_prob(self, action: Float[Array, "*batch A"]) -> Float[Array, "*batch"]:
-        z = (action - self.mean) * jnp.exp(-self.log_std)
-        return jnp.sum(-0.5 * z**2 - self.log_std - 0.5 * jnp.log(2 * jnp.pi), axis=-1)
+        return jax.scipy.stats.norm.logpdf(action, self.mean, jnp.exp(self.log_std)).sum(axis=-1)
 
     def sample(self, key: PRNGKeyArray) -> Float[Array, "*batch A"]:
         noise = jax.random.normal(key, self.mean.shape)
         return jnp.clip(self.mean + jnp.exp(self.log_std) * noise, -1.0, 1.0)
 
     def mode(self) -> Float[Array, "*batch A"]:
-        return self.mean
+        return jnp.clip(self.mean, -1.0, 1.0)
+
+
+class Mixture(NamedTuple):
+    """Mixture of M diagonal Gaussians; its mode is taken to be the mean of the likeliest component."""
+
+    logits: Float[Array, "*batch M"]
+    mean: Float[Array, "*batch M A"]
+    log_std: Float[Array, "*batch M A"]
+
+    def log_prob(self, action: Float[Array, "*batch A"]) -> Float[Array, "*batch"]:
+        action = jnp.broadcast_to(action[..., None, :], self.mean.shape)
+        of_components = Gaussian(self.mean, self.log_std).log_prob(action)
+        return jax.nn.logsumexp(jax.nn.log_softmax(self.logits) + of_components, axis=-1)
+
+    def sample(self, key: PRNGKeyArray) -> Float[Array, "*batch A"]:
+        key_which, key_action = jax.random.split(key)
+        which = jax.random.categorical(key_which, self.logits)
+        return self._component(which).sample(key_action)
+
+    def mode(self) -> Float[Array, "*batch A"]:
+        return self._component(jnp.argmax(self.logits, axis=-1)).mode()
+
+    def _component(self, which: Int[Array, "*batch"]) -> Gaussian:
+        index = which[..., None, None]
+        mean, log_std = (
+            jnp.take_along_axis(leaf, index, axis=-2).squeeze(-2)
+            for leaf in (self.mean, self.log_std)
+        )
+        return Gaussian(mean, log_std)
+
+
+class Binned(NamedTuple):
+    """Every dimension of an action for itself, on N evenly spaced values from -1 to 1.
+
+    An action counts as the nearest value; samples are spread evenly around theirs and clipped.
+    """
+
+    logits: Float[Array, "*batch A N"]
+
+    def log_prob(self, action: Float[Array, "*batch A"]) -> Float[Array, "*batch"]:
+        intervals = self.logits.shape[-1] - 1
+        nearest = jnp.round((action + 1) / 2 * intervals).astype(jnp.int32)
+        return jnp.sum(Categorical(self.logits).log_prob(nearest) + jnp.log(intervals / 2), axis=-1)
+
+    def sample(self, key: PRNGKeyArray) -> Float[Array, "*batch A"]:
+        key_value, key_around = jax.random.split(key)
+        value = jax.random.categorical(key_value, self.logits)
+        around = jax.random.uniform(key_around, value.shape, minval=-0.5, maxval=0.5)
+        return jnp.clip(2 * (value + around) / (self.logits.shape[-1] - 1) - 1, -1.0, 1.0)
+
+    def mode(self) -> Float[Array, "*batch A"]:
+        """The mean over the likeliest value and its two neighbors."""
+        num_values = self.logits.shape[-1]
+        likeliest = jnp.argmax(self.logits, axis=-1, keepdims=True)
+        near = jnp.abs(jnp.arange(num_values) - likeliest) <= 1
+        weights = jax.nn.softmax(jnp.where(near, self.logits, -jnp.inf))
+        return weights @ jnp.linspace(-1.0, 1.0, num_values)
 
 
 class Head(NamedTuple):
@@ -73,12 +129,36 @@ class Head(NamedTuple):
     make: Callable[[Array], Distribution]
 
 
+NUM_COMPONENTS = 5
+NUM_VALUES = 41
+LOG_STD_RANGE = (-5.0, 1.0)
+FIXED_LOG_STD = -1.0  # authors' code
+
+
 def _make_gaussian(params: Array) -> Gaussian:
     mean, log_std = jnp.split(params, 2, axis=-1)
-    return Gaussian(jnp.tanh(mean), jnp.clip(log_std, -5.0, 1.0))
+    return Gaussian(mean, jnp.clip(log_std, *LOG_STD_RANGE))
+
+
+def _make_fixed_gaussian(params: Array) -> Gaussian:
+    return Gaussian(jnp.tanh(params), jnp.full_like(params, FIXED_LOG_STD))
+
+
+def _make_mixture(params: Array) -> Mixture:
+    logits, rest = params[..., :NUM_COMPONENTS], params[..., NUM_COMPONENTS:]
+    rest = rest.reshape(*rest.shape[:-1], 2, NUM_COMPONENTS, -1)
+    return Mixture(logits, rest[..., 0, :, :], jnp.clip(rest[..., 1, :, :], *LOG_STD_RANGE))
+
+
+def _make_binned(params: Array) -> Binned:
+    return Binned(params.reshape(*params.shape[:-1], -1, NUM_VALUES))
 
 
 HEADS = {
     "categorical": Head(lambda action_dim: action_dim, Categorical),
     "gaussian": Head(lambda action_dim: 2 * action_dim, _make_gaussian),
+    "fixed_gaussian": Head(lambda action_dim: action_dim, _make_fixed_gaussian),
+    "mixture": Head(lambda action_dim: NUM_COMPONENTS * (1 + 2 * action_dim), _make_mixture),
+    "binned": Head(lambda action_dim: NUM_VALUES * action_dim, _make_binned),
 }
+"""By name; the first is for discrete actions, the others for actions in [-1, 1]."""

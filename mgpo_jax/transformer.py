@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import flax.linen as nn
 import jax
@@ -27,6 +27,7 @@ from mgpo_jax.types import Prompt
 
 # Attention over the keys of one query block at a time: never the full score matrix.
 QUERY_BLOCK = 128
+OBS_LIMIT = 5.0  # standard deviations; an observation farther out counts as this far
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,8 @@ class TransformerConfig:
     action_dim: int
     horizon: int
     """Largest number of steps T of an episode."""
-    head: Literal["categorical", "gaussian"] = "categorical"
+    head: str = "categorical"
+    """The action distribution, one of ``distributions.HEADS``."""
     max_prompt_length: int = 5
     """K, the number of prompt slots."""
     embed_dim: int = 128
@@ -48,6 +50,9 @@ class TransformerConfig:
     """Rate on embeddings, attention weights and residual branches."""
     prompt_order: bool = True
     """Whether prompt slots carry a position embedding (the paper's network: False)."""
+    obs_mean: tuple[float, ...] = ()
+    """Of the observations in training, size D, where they are standardized (empty: they are not)."""
+    obs_std: tuple[float, ...] = ()
 
 
 class KVCache(NamedTuple):
@@ -255,6 +260,9 @@ class GoalTransformer(nn.Module):
         return tokens + self.embed_slot if self.config.prompt_order else tokens
 
     def _obs_token(self, obs: Float[Array, "T D"], time: Array) -> Float[Array, "T E"]:
+        if self.config.obs_mean:
+            obs = (obs - jnp.array(self.config.obs_mean)) / jnp.array(self.config.obs_std)
+            obs = jnp.clip(obs, -OBS_LIMIT, OBS_LIMIT)
         return self.embed_obs(obs) + time
 
     def _action_token(self, actions: Array, time: Array) -> Float[Array, "T E"]:

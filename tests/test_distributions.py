@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import special, stats
 
-from mgpo_jax.distributions import HEADS, Categorical, Gaussian
+from mgpo_jax.distributions import HEADS, Binned, Categorical, Gaussian, Mixture
 
 LOGITS = np.array([0.3, -1.2, 2.0, 0.0, -0.4], np.float32)
 MEAN = np.array([0.2, -0.5], np.float32)
@@ -72,19 +72,103 @@ def test_gaussian_mode_is_its_mean():
     np.testing.assert_array_equal(Gaussian(jnp.asarray(MEAN), jnp.asarray(LOG_STD)).mode(), MEAN)
 
 
-@pytest.mark.parametrize(("name", "num_params"), [("categorical", 3), ("gaussian", 6)])
+def test_gaussian_mode_is_an_action():
+    distribution = Gaussian(jnp.array([0.4, -1.3, 7.0]), jnp.zeros(3))
+    np.testing.assert_allclose(distribution.mode(), [0.4, -1.0, 1.0])
+
+
+WEIGHTS = np.array([0.2, 0.5, 0.3])
+MEANS = np.array([[0.0, 0.8], [-0.6, 0.1], [0.5, -0.4]])
+LOG_STDS = np.array([[-1.0, -2.0], [-0.5, -3.0], [-2.5, -0.2]])
+
+
+def a_mixture():
+    return Mixture(*(jnp.asarray(x, jnp.float32) for x in (np.log(WEIGHTS) + 3, MEANS, LOG_STDS)))
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(-1, 1, width=32), min_size=2, max_size=2))
+def test_mixture_log_prob(action):
+    action = np.array(action)
+    densities = stats.norm.pdf(action, MEANS, np.exp(LOG_STDS)).prod(axis=1)
+    log_prob = a_mixture().log_prob(jnp.asarray(action, jnp.float32))
+    np.testing.assert_allclose(log_prob, np.log(WEIGHTS @ densities), rtol=1e-4, atol=1e-4)
+
+
+def test_mixture_samples_have_its_distribution():
+    keys = jax.random.split(jax.random.key(2), 4000)
+    samples = np.asarray(jax.vmap(a_mixture().sample)(keys))
+    for dimension in range(2):
+        column = samples[:, dimension]
+        inside = column[abs(column) < 1]
+        parts = stats.norm(MEANS[:, dimension], np.exp(LOG_STDS[:, dimension]))
+        low, high = (WEIGHTS @ parts.cdf(np.full(3, edge)) for edge in (-1, 1))
+
+        def cdf(x, parts=parts, low=low, high=high):
+            return (WEIGHTS @ parts.cdf(np.asarray(x)[None, :].repeat(3, 0).T).T - low) / (
+                high - low
+            )
+
+        assert stats.kstest(inside, cdf).pvalue > 1e-3
+
+
+def test_mixture_mode_is_the_mean_of_the_likeliest_component():
+    np.testing.assert_allclose(a_mixture().mode(), MEANS[1], rtol=1e-6)
+    two = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf[::-1]]), a_mixture())
+    np.testing.assert_allclose(two.mode(), [MEANS[1], MEANS[1]], rtol=1e-6)
+
+
+def test_binned_by_hand():
+    # Five values -1, -0.5, 0, 0.5, 1; density of a value: its probability over 0.5.
+    masses = np.array([[0.1, 0.6, 0.2, 0.05, 0.05], [0.0625, 0.0625, 0.0625, 0.1875, 0.625]])
+    distribution = Binned(jnp.log(jnp.asarray(masses, jnp.float32)) - 1.0)
+    expected = np.log(0.6 / 0.5) + np.log(0.625 / 0.5)
+    log_prob = distribution.log_prob(jnp.array([-0.7, 1.0]))
+    np.testing.assert_allclose(log_prob, expected, rtol=1e-5)
+    np.testing.assert_allclose(
+        distribution.mode(), [(-0.1 - 0.3) / 0.9, (0.1875 * 0.5 + 0.625) / 0.8125], rtol=1e-5
+    )
+
+
+def test_binned_integrates_to_one_but_for_half_an_interval_at_each_end():
+    distribution = Binned(jax.random.normal(jax.random.key(0), (1, 41)))
+    grid = np.linspace(-1.025, 1.025, 41 * 50 + 1)[:-1] + 0.0005
+    density = np.exp(jax.vmap(distribution.log_prob)(jnp.asarray(grid, jnp.float32)[:, None]))
+    assert density.mean() * 2.05 == pytest.approx(1.0, abs=1e-3)
+
+
+def test_binned_samples_have_its_probabilities():
+    logits = jnp.array([[0.3, -1.2, 2.0, 0.0, -0.4]])
+    keys = jax.random.split(jax.random.key(3), 5000)
+    samples = np.asarray(jax.vmap(Binned(logits).sample)(keys))[:, 0]
+    assert abs(samples).max() <= 1
+    counts = np.bincount(np.round(2 * (samples + 1)).astype(int), minlength=5)
+    expected = special.softmax(np.asarray(logits[0], np.float64)) * len(keys)
+    assert stats.chisquare(counts, expected).pvalue > 1e-3
+    inside = samples[np.abs(samples) < 0.25]
+    assert stats.kstest(inside, stats.uniform(-0.25, 0.5).cdf).pvalue > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("name", "num_params"),
+    [("categorical", 3), ("gaussian", 6), ("fixed_gaussian", 3), ("mixture", 35), ("binned", 123)],
+)
 def test_heads_turn_their_parameters_into_a_distribution(name, num_params):
     head = HEADS[name]
     assert head.num_params(3) == num_params
-    params = jnp.linspace(-1.0, 1.0, num_params)
-    distribution = head.make(params)
-    action = distribution.mode()
-    assert action.shape == (() if name == "categorical" else (3,))
-    assert np.isfinite(distribution.log_prob(action))
+    for shape in ((num_params,), (4, num_params)):
+        distribution = head.make(jnp.linspace(-1.0, 1.0, np.prod(shape)).reshape(shape))
+        actions = distribution.mode(), distribution.sample(jax.random.key(0))
+        for action in actions:
+            assert action.shape == shape[:-1] + (() if name == "categorical" else (3,))
+            assert distribution.log_prob(action).shape == shape[:-1]
+            assert np.isfinite(distribution.log_prob(action)).all()
 
 
-def test_gaussian_head_bounds_mean_and_spread():
+def test_gaussian_heads_bound_their_spread():
     distribution = HEADS["gaussian"].make(jnp.array([0.7, -40.0, -90.0, 90.0]))
-    np.testing.assert_allclose(distribution.mean, np.tanh([0.7, -40.0]), rtol=1e-5)
     np.testing.assert_array_equal(distribution.log_std, [-5.0, 1.0])
     assert np.isfinite(distribution.log_prob(jnp.array([1.0, -1.0])))
+    fixed = HEADS["fixed_gaussian"].make(jnp.array([0.7, -40.0]))
+    np.testing.assert_allclose(fixed.mean, np.tanh([0.7, -40.0]), rtol=1e-5)
+    np.testing.assert_array_equal(fixed.log_std, [-1.0, -1.0])

@@ -185,7 +185,7 @@ class TestLengths:
         np.testing.assert_array_equal(dataset.lengths, num_steps(starts, training_orders))
         assert facts["length"]["mean"] == dataset.lengths.mean()
         assert facts["at_horizon"] == 0
-        assert facts["dropped_short"] == 0
+        assert facts["tried_again"] == 0
 
 
 class TestDataset:
@@ -239,4 +239,3 @@ class TestDataset:
 def test_demonstrators_by_name():
     known = demonstrators(WORLD)
     assert list(known) == ["expert"]
-    assert known["expert"].min_length == 1

@@ -52,7 +52,7 @@ def grid_demonstrators(env: GridWorld) -> dict[str, Demonstrator]:
     expert = Demonstrator(
         sample_task=lambda key, index: env.task(index),
         agent=switcher(),
-        min_length=1,
+        keeps=lambda episode: episode.trajectory.length > 0,
         hindsight_return=hindsight_return,
     )
     return {"expert": expert}

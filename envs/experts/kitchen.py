@@ -380,7 +380,7 @@ def kitchen_demonstrators(env: Kitchen) -> dict[str, Demonstrator]:
     expert = Demonstrator(
         sample_task=lambda key, index: env.task(index),
         agent=scripted_arm(env),
-        min_length=1,
+        keeps=lambda episode: episode.return_ > 0.999,  # complete, in order
         hindsight_return=hindsight_return,
     )
     return {"expert": expert}

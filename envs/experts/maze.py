@@ -148,6 +148,9 @@ def maze_demonstrators(env: MazeRunner) -> dict[str, Demonstrator]:
         del index
         return MazeTask(generate_maze(key, env.side), jnp.zeros(2, jnp.int32))
 
+    def long_enough(episode: Any) -> Bool[Array, "*batch"]:
+        return episode.trajectory.length >= MIN_LENGTH
+
     agents = {
         "astar1": astar(env, 1),
         "astar2": astar(env, 2),
@@ -155,6 +158,6 @@ def maze_demonstrators(env: MazeRunner) -> dict[str, Demonstrator]:
         "random": random_walk(env),
     }
     return {
-        name: Demonstrator(endless_task, agent, MIN_LENGTH, first_hit_return)
+        name: Demonstrator(endless_task, agent, long_enough, first_hit_return)
         for name, agent in agents.items()
     }

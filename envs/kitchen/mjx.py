@@ -1,7 +1,6 @@
 """MuJoCo in JAX (MJX): the reduced kitchen as a part of jitted programs, for accelerators.
 
-On CPUs the program that holds it must be compiled with ``CPU_OPTIONS``: the fusion emitters of XLA's CPU
-backend make its batched graph hundreds of times slower.
+On CPUs a program that holds it must be compiled with ``EnvSpec.compiler_options``.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ from mujoco import mjx
 from envs.kitchen.model import SUBSTEPS, initial_state, load_model, scene_coordinates
 from envs.kitchen.physics import Physics, PhysicsState
 
-CPU_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
 # Lanes of a program wait for the slowest, so the solver stops early; it starts from the last solution.
 ITERATIONS, LINE_SEARCH_ITERATIONS = 4, 6
 

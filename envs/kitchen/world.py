@@ -53,6 +53,8 @@ MAX_SHIFT = 2.0 * 0.08  # action scale times control period (FrankaRobot: act_rn
 # Bounds of the position targets (franka_config.xml), rad and m.
 TARGET_LOW = (-2.9, -1.8, -2.9, -3.1, -2.9, 0.0, -2.9, 0.0, 0.0)
 TARGET_HIGH = (2.9, 1.8, 2.9, 0.0, 2.9, 3.8, 2.9, 0.04, 0.04)
+# The fusion emitters of XLA's CPU backend make MJX's batched graph hundreds of times slower.
+MJX_ON_CPU = (("xla_cpu_use_fusion_emitters", False),)
 MAX_SPEED = 1e3  # of any joint; physics beyond has diverged
 
 
@@ -123,7 +125,11 @@ class Kitchen:
             deterministic=True,
             reward_confirms_goals=True,
             num_test_tasks=25,
+            compiler_options=MJX_ON_CPU if self._is_mjx_on_cpu() else (),
         )
+
+    def _is_mjx_on_cpu(self) -> bool:
+        return self.backend == "mjx" and jax.default_backend() == "cpu"
 
     @property
     def physics(self) -> Physics:

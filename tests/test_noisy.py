@@ -1,0 +1,102 @@
+"""Noise on observations and actions, around worlds with discrete and with continuous actions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+import envs
+from envs.base import Environment, EnvSpec, TimeStep
+from envs.noisy import Noisy
+
+MAZE = envs.make("maze15")
+NUM = 2000
+
+
+@dataclass(frozen=True)
+class Echo(Environment):
+    """A world of one step that shows the action it was given."""
+
+    spec = EnvSpec(
+        name="echo", obs_dim=3, goal_dim=1, action_dim=3, discrete=False, horizon=1,
+        return_range=(0.0, 1.0), truncate_in_hindsight=False, deterministic=True,
+        reward_confirms_goals=False,
+    )  # fmt: skip
+
+    def reset(self, key, task):
+        return jnp.zeros(3), self.show(jnp.zeros(3))
+
+    def step(self, state, action):
+        return action, self.show(action)
+
+    def show(self, obs):
+        no = jnp.zeros((), bool)
+        return TimeStep(obs, jnp.zeros(1), no, jnp.zeros(1), jnp.zeros(()), no, no)
+
+
+def steps(env, action):
+    """Observations of ``NUM`` resets and of a step after each."""
+
+    def play(key):
+        state, first = env.reset(key, None)
+        _, after = env.step(state, action)
+        return first.obs, after.obs
+
+    return jax.tree.map(np.asarray, jax.vmap(play)(jax.random.split(jax.random.key(0), NUM)))
+
+
+def test_without_noise_nothing_changes():
+    noisy = Noisy(MAZE)
+    assert isinstance(noisy, Environment)
+    assert not noisy.spec.deterministic
+    task = noisy.sample_task(jax.random.key(3))
+    (state, a), (inner, b) = (
+        noisy.reset(jax.random.key(0), task),
+        MAZE.reset(jax.random.key(0), task),
+    )
+    for action in (0, 3, 1, 1):
+        (state, a), (inner, b) = (
+            env.step(at, jnp.int32(action)) for env, at in ((noisy, state), (MAZE, inner))
+        )
+        jax.tree.map(np.testing.assert_array_equal, (state.inner, a), (inner, b))
+    assert (noisy.task_goal(task) == MAZE.task_goal(task)).all()
+    assert (noisy.fingerprint(task) == MAZE.fingerprint(task)).all()
+    assert noisy.optimal_return(task) == MAZE.optimal_return(task)
+    with pytest.raises(ValueError, match="maze"):
+        noisy.check_task(task)
+
+
+def test_observation_noise():
+    first, after = steps(Noisy(Echo(), obs_noise=0.3), jnp.array([0.5, 0.0, -0.9]))
+    noise = np.concatenate([first, after - [0.5, 0.0, -0.9]])
+    assert stats.kstest(noise.ravel(), stats.norm(0, 0.3).cdf).pvalue > 1e-3
+    # Components, resets and steps are independent.
+    rows = np.concatenate([first, after], axis=1)
+    assert abs(np.corrcoef(rows.T) - np.eye(6)).max() < 0.1
+
+
+def test_action_noise_keeps_actions_in_their_range():
+    _, after = steps(Noisy(Echo(), action_noise=0.2), jnp.array([0.0, 1.0, -0.5]))
+    assert abs(after).max() <= 1
+    assert stats.kstest(after[:, 0], stats.norm(0, 0.2).cdf).pvalue > 1e-3
+    assert (after[:, 1] == 1).mean() == pytest.approx(0.5, abs=0.05)
+
+
+def test_noise_on_discrete_actions_replaces_them():
+    noisy = Noisy(MAZE, action_noise=0.4)
+    keys = jax.random.split(jax.random.key(0), NUM)
+    actions = np.asarray(jax.vmap(lambda key: noisy._disturb(key, jnp.int32(2)))(keys))
+    expected = NUM * (0.4 / 5 + 0.6 * (np.arange(5) == 2))
+    assert stats.chisquare(np.bincount(actions, minlength=5), expected).pvalue > 1e-3
+
+
+def test_refuses_what_is_no_noise():
+    with pytest.raises(ValueError, match="must not be negative, found -1"):
+        Noisy(Echo(), obs_noise=-1.0)
+    with pytest.raises(ValueError, match="a probability, found 2"):
+        Noisy(MAZE, action_noise=2.0)
