@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from envs.render.grid import draw_grid, draw_objects, grid_gif
-from envs.render.kitchen import kitchen_frames, kitchen_gif
+from envs.render.kitchen import Panel, kitchen_frames, kitchen_gif
 from envs.render.marks import spread_apart
 from envs.render.maze import (
     PROMPT_COLOR,
@@ -20,6 +20,7 @@ from envs.render.palette import INK
 __all__ = [
     "INK",
     "PROMPT_COLOR",
+    "Panel",
     "bar_lanes",
     "draw_grid",
     "draw_maze",

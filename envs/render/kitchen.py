@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
-import imageio.v3 as iio
 import numpy as np
 from jaxtyping import Float, UInt8
+from matplotlib.figure import Figure
 
-from envs.render.video import MAX_FRAMES
+from envs.render.palette import INK, PAPER
+from envs.render.video import write_gif
 
 NUM_ROBOT = 9
 POSITIONS = np.r_[:NUM_ROBOT, 2 * NUM_ROBOT : 39]  # places of the 30 positions in an observation
+DPI, ABOVE, BELOW = 100, 34, 18  # pixels an inch; pixels of text above and below a picture
+FRAMES = 75  # of a GIF
+GAP = 0.01  # between pictures, as a share of the width
 CAMERA = {"distance": 2.2, "azimuth": 70.0, "elevation": -35.0, "lookat": (-0.2, 0.5, 2.0)}
 
 
@@ -43,6 +49,8 @@ def kitchen_frames(
             "no OpenGL to draw the kitchen with: install EGL or OSMesa and set MUJOCO_GL=egl or "
             f"MUJOCO_GL=osmesa ({error})"
         ) from None
+    for costly in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+        renderer.scene.flags[costly] = False
     with renderer:
         frames = np.zeros((len(obs), height, width, 3), np.uint8)
         for frame, positions in zip(frames, np.asarray(obs)[:, POSITIONS], strict=True):
@@ -53,9 +61,37 @@ def kitchen_frames(
     return frames
 
 
-def kitchen_gif(path: Path, obs: Float[np.ndarray, "T 59"]) -> None:
-    """A GIF of an episode, of up to ``MAX_FRAMES`` of its times."""
-    times = np.unique(np.linspace(0, len(obs) - 1, min(len(obs), MAX_FRAMES)).round().astype(int))
-    frames = kitchen_frames(obs[times])
-    durations = [80] * (len(frames) - 1) + [1500]  # ms; the end stays on view
-    iio.imwrite(path, frames, extension=".gif", duration=durations, loop=0)
+class Panel(NamedTuple):
+    """One episode of a GIF."""
+
+    title: str
+    obs: Float[np.ndarray, "T 59"]
+    completed: Sequence[tuple[int, str]]
+    """Steps after which something was completed, and what."""
+
+
+def kitchen_gif(path: Path, panels: Sequence[Panel], height: int = 216, width: int = 288) -> None:
+    """Episodes side by side, at up to ``FRAMES`` of their times; those that end earlier stand still."""
+    num_steps = max(len(panel.obs) for panel in panels)
+    times = np.linspace(0, num_steps - 1, min(num_steps, FRAMES)).round().astype(int)
+    whole = ABOVE + height + BELOW
+    size = len(panels) * width / DPI, whole / DPI
+    figure = Figure(figsize=size, dpi=DPI, facecolor=PAPER)
+    drawn = []
+    for number, panel in enumerate(panels):
+        place = (number / len(panels), BELOW / whole, 1 / len(panels) - GAP, height / whole)
+        axes = figure.add_axes(place)
+        axes.set_axis_off()
+        axes.set_title(panel.title, color=INK, fontsize=7.5, pad=2)
+        below = axes.text(0.5, -0.02, "", color=INK, fontsize=7.5, transform=axes.transAxes)
+        below.set(ha="center", va="top")
+        frames = kitchen_frames(panel.obs[np.minimum(times, len(panel.obs) - 1)], height, width)
+        drawn.append((axes.imshow(frames[0]), below, frames))
+
+    def show(index: int) -> None:
+        for panel, (image, below, frames) in zip(panels, drawn, strict=True):
+            image.set_data(frames[index])
+            done = [what for when, what in panel.completed if when <= times[index]]
+            below.set_text(f"step {min(times[index], len(panel.obs))}: {', '.join(done) or '-'}")
+
+    write_gif(path, figure, show, len(times))

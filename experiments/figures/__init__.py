@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from envs.base import Environment
 from envs.grid_world import GridWorld
+from envs.kitchen import Kitchen
 from envs.maze_runner import MazeRunner
 from experiments.figures.base import NO_PICTURES, Pictures
 from experiments.figures.curves import learning_curve, training_curve
 from experiments.figures.grid import grid_pictures
+from experiments.figures.kitchen import kitchen_pictures
 from experiments.figures.maze import maze_pictures
 from experiments.figures.style import METHODS, STYLE, method_styles
 
@@ -28,4 +30,6 @@ def pictures(env: Environment) -> Pictures:
         return maze_pictures(env)
     if isinstance(env, GridWorld):
         return grid_pictures(env)
+    if isinstance(env, Kitchen):
+        return kitchen_pictures(env)
     return NO_PICTURES

@@ -1,0 +1,81 @@
+"""A video of the kitchen: a task under the prompt (g^M) and under the optimized one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.kitchen import Kitchen, KitchenTask
+from envs.render import Panel, kitchen_gif
+from experiments.figures.base import LoadPolicy, Pictures, Save, file_names, goals_of
+from experiments.results import Results
+from experiments.runtime import jit_with
+from mgpo_jax.adapt import evaluate
+from mgpo_jax.errors import UsageError
+from mgpo_jax.policy import Policy
+from mgpo_jax.prompts import single_goal
+from mgpo_jax.types import Episode, Prompt
+
+NAMES = ("burner", "light", "slide", "hinge", "microwave")  # of the subtasks
+
+
+def kitchen_pictures(env: Kitchen) -> Pictures:
+    """A GIF of the first task for each adaptation."""
+    return Pictures(lambda *_: iter(()), partial(draw_all, env))
+
+
+def draw_all(
+    env: Kitchen,
+    results: Mapping[str, Results],
+    load: LoadPolicy,
+    which: Sequence[int],
+    seed: int,
+) -> Iterator[tuple[str, Save]]:
+    """All figures of some adaptations."""
+    for name, result in file_names(results.values()).items():
+        save = partial(before_and_after, env, load(result), result, which[0], seed)
+        yield f"{name}_episode_task{which[0]}.gif", save
+
+
+def before_and_after(
+    env: Kitchen, policy: Policy, result: Results, index: int, seed: int, path: Path
+) -> None:
+    """Greedy episodes under the initial and under the optimized prompt, side by side."""
+    task = KitchenTask(jnp.asarray(result.tasks["order"][index]))
+    prompts = {
+        "Initial prompt": single_goal(env.task_goal(task), policy.num_slots),
+        "Optimized prompt": result.best_prompt(seed, index),
+    }
+    episode = jit_with(env)(lambda prompt: evaluate(jax.random.key(0), env, policy, task, prompt))
+    panels = [
+        panel(f"{name}\n{words(prompt)}", episode(prompt)) for name, prompt in prompts.items()
+    ]
+    try:
+        kitchen_gif(path, panels)
+    except RuntimeError as error:
+        raise UsageError(str(error)) from None
+
+
+def panel(title: str, episode: Episode) -> Panel:
+    """An episode as what it looked like and what was completed when."""
+    trajectory = jax.tree.map(np.asarray, episode.trajectory)
+    times = np.flatnonzero(trajectory.goal_reached[: trajectory.length])
+    completed = [(int(time), NAMES[trajectory.goals[time].argmax()]) for time in times]
+    return Panel(title, trajectory.obs[: trajectory.length], completed)
+
+
+def words(prompt: Prompt) -> str:
+    """A prompt in words; goals that are no subtasks (BBT) by their numbers."""
+    return " > ".join(_word(goal) for goal in goals_of(prompt))
+
+
+def _word(goal: np.ndarray) -> str:
+    if not np.isin(goal, (0.0, 1.0)).all():
+        return f"({', '.join(f'{value:.1f}' for value in goal)})"
+    named = [NAMES[index] for index in np.flatnonzero(goal)]
+    return named[0] if len(named) == 1 else "{" + ", ".join(named) + "}"
