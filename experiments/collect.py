@@ -85,7 +85,7 @@ def collect(
     """Demonstrations, none of them of a test task, and facts about them.
 
     Those that are not worth keeping are tried again with another key, so that a demonstrator that goes
-    through all tasks in turn demonstrates each of them equally often.
+    through all tasks in turn demonstrates each of them equally often, but for the last batch.
     """
     demonstrate = demonstration_program(env, demonstrator)
     forbidden = task_hashes(env, benchmark_tasks(env))

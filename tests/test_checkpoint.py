@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -67,6 +68,40 @@ def test_policy_comes_back(policy: Path, params: dict) -> None:
     assert config == CONFIG
     assert made == {"env": "maze15"}
     jax.tree.map(np.testing.assert_array_equal, loaded, params)
+
+
+def test_standardization_comes_back(tmp_path: Path, params: dict) -> None:
+    size = SPEC.obs_dim
+    config = replace(CONFIG, obs_mean=(0.25,) * size, obs_std=tuple(0.1 * n + 1 for n in range(size)))
+    save_policy(tmp_path / "policy", config, params, {})
+    loaded, _, _ = load_policy_files(tmp_path / "policy", SPEC)
+    assert loaded == config
+    assert hash(loaded) == hash(config)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"obs_mean": [0.0] * 4}, "obs_mean must hold 6 finite numbers"),
+        ({"obs_std": [float("nan")] * 6}, "obs_std must hold 6 finite numbers"),
+        ({"head": "gausian"}, "unknown head 'gausian'"),
+    ],
+)
+def test_damaged_network_settings(policy: Path, change: dict, says: str) -> None:
+    document = json.loads((policy / "config.json").read_text())
+    document["network"] |= change
+    (policy / "config.json").write_text(json.dumps(document))
+    with pytest.raises(DataError, match=says):
+        load_policy_files(policy, SPEC)
+
+
+def test_heads_must_fit_the_actions() -> None:
+    with pytest.raises(UsageError, match="unknown head for maze15 'gaussian'"):
+        network_config(SPEC, head="gaussian")
+    continuous = replace(SPEC, discrete=False)
+    assert network_config(continuous).head == "gaussian"
+    with pytest.raises(UsageError, match="did you mean 'mixture'"):
+        network_config(continuous, head="mixtur")
 
 
 def test_missing_policy_is_a_usage_error(tmp_path: Path) -> None:

@@ -56,6 +56,19 @@ def make_full(config):
     return lambda *inputs: jnp.concatenate(network.apply(*inputs), axis=-1)
 
 
+def test_standardized_observations():
+    """The same as standardizing first; what lies far out counts as five deviations."""
+    params = make_params(CONFIG)
+    mean, std = (0.5, -1.0, 2.0), (0.5, 2.0, 0.1)
+    prompt, obs, actions = make_inputs(CONFIG)
+    raw = (obs * jnp.array(std) + jnp.array(mean)).at[3, 1].set(1e4)
+    standardizing = make_full(replace(CONFIG, obs_mean=mean, obs_std=std))
+    expected = make_full(CONFIG)(params, prompt, obs.at[3, 1].set(5.0), actions)
+    np.testing.assert_allclose(
+        standardizing(params, prompt, raw, actions), expected, rtol=1e-4, atol=1e-4
+    )
+
+
 @pytest.fixture(scope="module")
 def params():
     return make_params(CONFIG)

@@ -1,0 +1,29 @@
+"""Collection: what is not worth keeping is tried again."""
+
+from __future__ import annotations
+
+import numpy as np
+
+import envs
+from envs.experts import demonstrators
+from experiments.collect import collect
+from experiments.tasks import benchmark_tasks, task_hashes
+
+WORLD = envs.make("gridworld")
+FIRST = 5000  # of the tasks below
+
+
+def test_tasks_in_turn_are_demonstrated_equally_often() -> None:
+    """Dropped are episodes of every eighth length, which is a matter of luck, since starts are random."""
+    demonstrator = demonstrators(WORLD)["expert"]._replace(
+        sample_task=lambda key, index: WORLD.task(FIRST + index % 16),
+        keeps=lambda episode: episode.trajectory.length % 8 > 0,
+    )
+    dataset, facts = collect(WORLD, demonstrator, 2000, seed=0)
+    assert len(dataset) == 2000
+    assert (dataset.lengths % 8 > 0).all()
+    assert facts["tried_again"] > 100
+    _, counts = np.unique(dataset.task_hashes, return_counts=True)
+    tests = np.isin(task_hashes(WORLD, benchmark_tasks(WORLD)), dataset.task_hashes)
+    assert not tests.any()
+    assert counts.max() - counts.min() <= 6, counts
