@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import PartitionSpec
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, Float
 from tqdm import tqdm
 
 from envs.base import Environment, Task
@@ -28,7 +29,7 @@ from mgpo_jax.policy import Policy, transformer_policy
 from mgpo_jax.prompts import single_goal
 from mgpo_jax.sharding import AXIS, device_mesh, replicate, split
 from mgpo_jax.transformer import TransformerConfig
-from mgpo_jax.types import Prompt
+from mgpo_jax.types import PRNGKeyArray, Prompt
 
 LANES = "lanes"
 # Of key-value caches of lanes that share a clock: near a core of a CPU, in the memory of an accelerator.
@@ -58,6 +59,84 @@ def lanes_together(config: TransformerConfig) -> int:
     floats = 2 * config.num_layers * config.embed_dim * num_tokens
     limit = GROUP_BYTES if jax.default_backend() == "cpu" else GROUP_BYTES_ACCELERATOR
     return max(1, limit // (4 * floats))
+
+
+class Layout(NamedTuple):
+    """How lanes are spread: over devices, and on each in groups that share a clock."""
+
+    mesh: Mesh
+    group: int
+    num_lanes: int
+    """With those that only fill up the last groups."""
+
+
+def lay_out(config: TransformerConfig, num_lanes: int) -> Layout:
+    """Spread at least ``num_lanes`` lanes evenly."""
+    mesh = device_mesh()
+    on_each = -(-num_lanes // mesh.devices.size)
+    num_groups = -(-on_each // lanes_together(config))
+    group = -(-on_each // num_groups)
+    return Layout(mesh, group, mesh.devices.size * num_groups * group)
+
+
+def run_lanes(env: Environment, layout: Layout, function: Callable) -> Any:
+    """A jitted ``function`` over all lanes; its last argument is shared by them."""
+    spec = PartitionSpec(AXIS)
+
+    def on_device(*args: Any) -> Any:
+        *own, shared = args
+        grouped = jax.tree.map(lambda leaf: leaf.reshape(-1, layout.group, *leaf.shape[1:]), own)
+        together = jax.vmap(lambda own: function(*own, shared), axis_name=LANES)
+        done = jax.lax.map(together, grouped)
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), done)
+
+    def call(*args: Any) -> Any:
+        in_specs = (spec,) * (len(args) - 1) + (PartitionSpec(),)
+        return jax.shard_map(
+            on_device, mesh=layout.mesh, in_specs=in_specs, out_specs=spec, check_vma=False
+        )(*args)
+
+    return jit_with(env)(call)
+
+
+def mean_greedy_return(
+    env: Environment,
+    config: TransformerConfig,
+    num_episodes: int,
+    key: PRNGKeyArray,
+    task: Task,
+    prompt: Prompt,
+    params: Any,
+) -> Float[Array, ""]:
+    """Of episodes under a prompt, outside of any search."""
+    policy = transformer_policy(config, params)
+    returns = jax.lax.map(
+        lambda key: evaluate(key, env, policy, task, prompt, LANES).return_,
+        jax.random.split(key, num_episodes),
+    )
+    return returns.mean()
+
+
+def evaluate_prompts(
+    env: Environment,
+    network: LoadedPolicy,
+    tasks: Task,
+    prompts: Prompt,
+    *,
+    episodes: int,
+    seed: int = 0,
+) -> np.ndarray:
+    """Mean greedy returns ``[S, N]`` of prompts ``[S, N, P, ..]``, one for each seed and task."""
+    seeds, num = prompts.mask.shape[:2]
+    layout = lay_out(network.config, seeds * num)
+    index = np.arange(layout.num_lanes) % (seeds * num)
+    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[index], prompts)
+    lane_tasks = jax.tree.map(lambda leaf: jnp.asarray(leaf)[index % num], tasks)
+    keys = jax.random.split(jax.random.key(seed), seeds * num)[index]
+    measure = run_lanes(env, layout, partial(mean_greedy_return, env, network.config, episodes))
+    lanes = split(layout.mesh, (keys, lane_tasks, flat))
+    returns = measure(*lanes, replicate(layout.mesh, network.params))
+    return np.asarray(returns)[: seeds * num].reshape(seeds, num)
 
 
 def run_adaptation(
@@ -124,16 +203,14 @@ def run_variants(
       keep_rewarded: whether bandits keep the rewarded goals of the best trajectory where
         ``EnvSpec.reward_confirms_goals``.
     """
-    num, mesh = num_tasks(tasks), device_mesh()
+    num = num_tasks(tasks)
     eval_episodes = eval_episodes or (1 if env.spec.deterministic else NUM_EVAL_EPISODES)
     keep_rewarded = keep_rewarded and env.spec.reward_confirms_goals
     lanes = len(variants) * seeds * num
-    on_each = -(-lanes // mesh.devices.size)
-    num_groups = -(-on_each // lanes_together(network.config))
-    group = -(-on_each // num_groups)
+    layout = lay_out(network.config, lanes)
+    mesh, over_lanes = layout.mesh, partial(run_lanes, env, layout)
     # Lanes beyond the last variant only fill up the last group.
-    padded = mesh.devices.size * num_groups * group
-    index = np.arange(padded)
+    index = np.arange(layout.num_lanes)
     lane_tasks = jax.tree.map(lambda leaf: jnp.asarray(leaf)[index % num], tasks)
     keys = jax.random.split(jax.random.key(seed), seeds * num)[index % (seeds * num)]
     which = index // (seeds * num) % len(variants)
@@ -153,25 +230,6 @@ def run_variants(
         options = {name: value for name, value in hyper.items() if name != "max_goals"}
         return policy, make_optimizer(space, **options)
 
-    def over_lanes(function: Callable) -> Any:
-        """Run for every lane, group by group on each device; the last argument is shared."""
-        spec = PartitionSpec(AXIS)
-
-        def on_device(*args: Any) -> Any:
-            *own, shared = args
-            grouped = jax.tree.map(lambda leaf: leaf.reshape(-1, group, *leaf.shape[1:]), own)
-            together = jax.vmap(lambda own: function(*own, shared), axis_name=LANES)
-            done = jax.lax.map(together, grouped)
-            return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), done)
-
-        def call(*args: Any) -> Any:
-            in_specs = (spec,) * (len(args) - 1) + (PartitionSpec(),)
-            return jax.shard_map(
-                on_device, mesh=mesh, in_specs=in_specs, out_specs=spec, check_vma=False
-            )(*args)
-
-        return jit_with(env)(call)
-
     @over_lanes
     def start(key: Any, task: Task, hyper: Any, params: Any) -> Any:
         return start_adaptation(key, env, *parts(params, hyper), task)
@@ -189,16 +247,7 @@ def run_variants(
 
         return advance
 
-    @over_lanes
-    def measure(key: Any, task: Task, prompt: Prompt, params: Any) -> Any:
-        """Mean return of greedy episodes under a prompt, outside of the search."""
-        policy = transformer_policy(network.config, params)
-        returns = jax.lax.map(
-            lambda key: evaluate(key, env, policy, task, prompt, LANES).return_,
-            jax.random.split(key, eval_episodes),
-        )
-        return returns.mean()
-
+    measure = over_lanes(partial(mean_greedy_return, env, network.config, eval_episodes))
     lane_tasks, keys, hyper = split(mesh, (lane_tasks, keys, hyper))
     params = replicate(mesh, network.params)
     state = start(keys, lane_tasks, hyper, params)
@@ -230,7 +279,7 @@ def run_variants(
     eval_returns = by_variant(np.stack(evaluations, axis=-1))
     # The search, too, begins with one evaluation of (g^M).
     after = np.concatenate([[1], np.cumsum(sizes)])
-    share = padded / len(variants)
+    share = layout.num_lanes / len(variants)
     total = round(share * (episodes + len(evaluations) * eval_episodes))
     return [
         Outcome(

@@ -113,7 +113,7 @@ def bench_collect(env: Environment, name: str | None, episodes: int) -> tuple[Da
 def bench_gradient_step(env: Environment, dataset: Dataset, num_steps: int) -> Iterator[Row]:
     """Steps of the default recipe over its own stream of batches."""
     config = pretrain_preset(env.spec.name, "fast")
-    network = configured_network(config, env)
+    network = configured_network(config, env, dataset)
     mesh = device_mesh(largest_divisor(config.train.part_size, len(jax.devices())))
     trainer = make_trainer(config.train, network, dataset, mesh)
     stream = batch_stream(config.train, dataset, env.spec.truncate_in_hindsight, mesh.devices.size)
@@ -159,7 +159,7 @@ def policy_to_bench(env: Environment, dataset: Dataset) -> tuple[LoadedPolicy, s
         return load_network(env, None), "released policy"
     except UsageError:
         fast = pretrain_preset(env.spec.name, "fast")
-        config = configured_network(fast, env)
+        config = configured_network(fast, env, dataset)
         params = make_trainer(fast.train, config, dataset, device_mesh(1)).init().params
         return LoadedPolicy(config, params, {}), "untrained policy"
 

@@ -90,7 +90,8 @@ def configured_network(
     network = network_config(env.spec, **{name: getattr(config, name) for name in common})
     if not config.standardize_obs:
         return network
-    mean, std = (stat(dataset.obs, axis=0, dtype=np.float64) for stat in (np.mean, np.std))
+    mean = dataset.obs.mean(axis=0, dtype=np.float64)
+    std = dataset.obs.std(axis=0, dtype=np.float64)
     std = np.where(std < CONSTANT, 1.0, std)
     return replace(network, obs_mean=tuple(mean.tolist()), obs_std=tuple(std.tolist()))
 

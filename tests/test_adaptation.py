@@ -12,8 +12,9 @@ import pytest
 import mgpo_jax.rollout
 from envs.grid_world import GridWorld
 from envs.maze_runner import MazeRunner
+from envs.noisy import Noisy
 from experiments import adaptation
-from experiments.adaptation import run_adaptation, run_variants
+from experiments.adaptation import evaluate_prompts, run_adaptation, run_variants
 from experiments.policies import LoadedPolicy
 from experiments.tasks import sample_tasks
 from mgpo_jax.checkpoint import network_config
@@ -113,3 +114,16 @@ def test_chance_is_averaged_out():
     assert many.num_episodes == 2 * 2 * (2 + 2 * adaptation.NUM_EVAL_EPISODES)
     assert run(eval_episodes=3).num_episodes == 2 * 2 * (2 + 2 * 3)
     assert np.isfinite(many.eval_returns).all()
+
+
+def test_prompts_evaluated_again_have_the_same_returns(sweep):
+    outcome = sweep[1]
+    best = jax.tree.map(lambda leaf: leaf[:, :, -1], outcome.log.best)
+    again = partial(evaluate_prompts, network=untrained(MAZE), tasks=sample_tasks(MAZE, 5, 3))
+    returns = again(MAZE, prompts=best, episodes=2)
+    np.testing.assert_allclose(returns, outcome.eval_returns[:, :, -1], atol=1e-5)
+    # Nothing but noise: every action is random, whatever the prompt.
+    blind = again(Noisy(MAZE, action_noise=1.0), prompts=best, episodes=40)
+    assert blind.shape == returns.shape
+    assert not np.allclose(blind, returns)
+    np.testing.assert_allclose(blind[0], blind[1], atol=0.4)

@@ -72,7 +72,9 @@ def test_policy_comes_back(policy: Path, params: dict) -> None:
 
 def test_standardization_comes_back(tmp_path: Path, params: dict) -> None:
     size = SPEC.obs_dim
-    config = replace(CONFIG, obs_mean=(0.25,) * size, obs_std=tuple(0.1 * n + 1 for n in range(size)))
+    config = replace(
+        CONFIG, obs_mean=(0.25,) * size, obs_std=tuple(0.1 * n + 1 for n in range(size))
+    )
     save_policy(tmp_path / "policy", config, params, {})
     loaded, _, _ = load_policy_files(tmp_path / "policy", SPEC)
     assert loaded == config

@@ -17,10 +17,11 @@ import pytest
 import tyro
 
 import envs
-from experiments import adapt, collect, pretrain, release, runtime
+from experiments import adapt, collect, evaluate, pretrain, release, runtime
 from experiments.adapt import AdaptConfig
 from experiments.collect import CollectConfig
 from experiments.configs import PretrainConfig, pretrain_default, pretrain_preset
+from experiments.evaluate import EvaluateConfig
 from experiments.release import ReleaseConfig
 from experiments.tasks import benchmark_tasks, load_tasks, sample_tasks, save_tasks, task_hashes
 from mgpo_jax.checkpoint import load_policy_files
@@ -43,6 +44,7 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
         "collect": (CollectConfig, collect.main),
         "pretrain": (tyro.conf.OmitArgPrefixes[PretrainConfig], pretrain.main, pretrain_default),
         "adapt": (tyro.conf.OmitArgPrefixes[AdaptConfig], adapt.main),
+        "evaluate": (EvaluateConfig, evaluate.main),
         "release": (ReleaseConfig, release.main),
     }
 
@@ -107,6 +109,9 @@ POLICY = RUN / "policy"
         ("pretrain --batch-size 10 --part-size 4", 2, "not a multiple"),
         ("collect --policy astr4", 2, "did you mean 'astar4'"),
         ("collect --episodes 0", 2, "--episodes must be at least 1"),
+        ("evaluate", 2, "no result folder given"),
+        ("evaluate nowhere --obs-noise -1", 2, "must not be negative"),
+        ("evaluate nowhere", 1, "no result folder nowhere"),
     ],
 )
 def test_usage_errors_name_the_mend(command: Run, line: str, code: int, says: str) -> None:
@@ -247,6 +252,12 @@ def test_adapt_writes_what_it_prints(
     np.testing.assert_allclose(
         np.maximum.accumulate(greedy, axis=-1)[:, :, [0, 1, 3, 4]], raw["eval_returns"], atol=1e-5
     )
+
+    code, text = command("evaluate result --episodes 1 --json noise.json")
+    assert code == 0, text
+    (row,) = json.loads(Path("noise.json").read_text())["rows"]
+    assert row["return"] == pytest.approx(summary["final_return"])
+    assert row["change"] == pytest.approx(0, abs=1e-5)
 
 
 def test_prompts_longer_than_trained(command: Run, workspace: Path) -> None:
