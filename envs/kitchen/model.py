@@ -88,6 +88,8 @@ HANDLES = (
     ),
 )
 COUNTER_HEIGHT = 1.6  # m
+# MJX solves as many contacts as there may be, here the nearest so many; demonstrations have up to 2.
+MAX_CONTACTS = 8
 SITES = (
     "end_effector",
     "knob2_site",
@@ -172,6 +174,7 @@ def reduce_model(full: mujoco.MjModel) -> mujoco.MjModel:
             solimp=[0.95, 0.99, 0.001, 0.5, 2],
             margin=0.001,
         )
+    spec.add_numeric(name="max_contact_points", data=[MAX_CONTACTS])
     for index in range(full.nu):
         _copy_actuator(full, index, spec)
     return spec.compile()
