@@ -132,6 +132,13 @@ def demonstrate(env: Kitchen, num: int) -> Episode:
     return jax.tree.map(np.asarray, done)
 
 
+def completions(episodes: Episode) -> list[np.ndarray]:
+    """The subtasks that each episode completed, in order."""
+    trajectory = episodes.trajectory
+    pairs = zip(trajectory.goals, trajectory.goal_reached, strict=True)
+    return [goals[reached].argmax(axis=1) for goals, reached in pairs]
+
+
 def replay(episodes: Episode) -> Iterator[tuple[list[str], list[str], float]]:
     """FrankaKitchen, taken to each recorded state and given the recorded action.
 
@@ -142,9 +149,8 @@ def replay(episodes: Episode) -> Iterator[tuple[list[str], list[str], float]]:
     kitchen = gymnasium_kitchen()
     robot = kitchen.robot_env
     trajectory = episodes.trajectory
-    for index, length in enumerate(trajectory.length):
-        goals = trajectory.goals[index][trajectory.goal_reached[index]]
-        completed = [SUBTASKS[subtask] for subtask in np.argmax(goals, axis=1)]
+    for index, completed in enumerate(completions(episodes)):
+        length = trajectory.length[index]
         kitchen.reset(seed=0)
         error = 0.0
         for step in range(length):
@@ -156,7 +162,8 @@ def replay(episodes: Episode) -> Iterator[tuple[list[str], list[str], float]]:
             if step + 1 < length:
                 shift = np.abs(theirs["observation"] - trajectory.obs[index, step + 1])
                 error = max(error, float(shift[ARM].max()), float(shift[OBJECTS].max()))
-        yield completed, list(info["episode_task_completions"]), error
+        ours = [SUBTASKS[subtask] for subtask in completed]
+        yield ours, list(info["episode_task_completions"]), error
 
 
 def main(config: FidelityConfig) -> None:
@@ -182,17 +189,22 @@ def main(config: FidelityConfig) -> None:
             text = "".join(f"{np.median(cell):>9.0e}{cell.max():>9.0e}" for cell in cells)
             print(f"{f'{first}, {second}':<44}{part:<8}{text}")
     print(flush=True)
-    for model in ("reduced", "stock"):
-        env = Kitchen("kitchen", 500, "native", model)
-        episodes = demonstrate(env, config.demonstrations)
+    on_stock = demonstrate(Kitchen("kitchen", 500, "native", "stock"), config.demonstrations)
+    on_reduced = demonstrate(Kitchen("kitchen", 500, "native"), config.demonstrations)
+    demonstrations = {STOCK: on_stock, REDUCED: on_reduced}
+    if config.mjx:
+        demonstrations[MJX] = demonstrate(Kitchen("kitchen", 500, "mjx"), config.demonstrations)
+    for name, episodes in demonstrations.items():
         complete = int((episodes.return_ > 0.99).sum())
+        same = sum(map(np.array_equal, completions(episodes), completions(on_reduced)))
         length = episodes.trajectory.length.mean()
         print(
-            f"demonstrator on the {model} model: {complete} of {config.demonstrations} complete all "
-            f"five in order, {length:.0f} steps on average",
+            f"demonstrator, {name}: {complete} of {config.demonstrations} complete all five in order, "
+            f"{length:.0f} steps on average; {same} complete the same in the same order as with "
+            f"the {REDUCED}",
             flush=True,
         )
-    outcomes = list(replay(episodes))
+    outcomes = list(replay(on_stock))
     same = sum(ours == theirs for ours, theirs, _ in outcomes)
     error = max(error for _, _, error in outcomes)
     print(
