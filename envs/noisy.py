@@ -7,9 +7,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, PRNGKeyArray
 
-from envs.base import Environment, EnvSpec, State, Task, TimeStep
+from envs.base import EnvSpec, State, Task, TimeStep
+from envs.wrapper import Wrapper
 
 
 class NoisyState(NamedTuple):
@@ -20,17 +21,15 @@ class NoisyState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Noisy:
+class Noisy(Wrapper):
     """A world behind Gaussian noise.
 
     Attributes:
-      env: the world.
       obs_noise: standard deviation on every component of an observation, in its units.
       action_noise: standard deviation on continuous actions, which are clipped to [-1, 1] again; a
         discrete action is replaced by a random one with this probability.
     """
 
-    env: Environment
     obs_noise: float = 0.0
     action_noise: float = 0.0
 
@@ -48,24 +47,6 @@ class Noisy:
     @property
     def spec(self) -> EnvSpec:
         return replace(self.env.spec, deterministic=False)
-
-    def sample_task(self, key: PRNGKeyArray) -> Task:
-        return self.env.sample_task(key)
-
-    def sample_goal(self, key: PRNGKeyArray) -> Float[Array, "G"]:
-        return self.env.sample_goal(key)
-
-    def task_goal(self, task: Task) -> Float[Array, "G"]:
-        return self.env.task_goal(task)
-
-    def optimal_return(self, task: Task) -> Float[Array, ""]:
-        return self.env.optimal_return(task)
-
-    def fingerprint(self, task: Task) -> Int[Array, "F"]:
-        return self.env.fingerprint(task)
-
-    def check_task(self, task: Task) -> None:
-        self.env.check_task(task)
 
     def reset(self, key: PRNGKeyArray, task: Task) -> tuple[NoisyState, TimeStep]:
         key, key_reset, key_obs = jax.random.split(key, 3)
