@@ -34,6 +34,7 @@ class EnvSpec:
       reward_confirms_goals: whether a reward at a goal says that this goal was the right one at this
         point, as where a sequence is rewarded part by part.
       num_test_tasks: tasks kept for test.
+      worlds_together: how many worlds a step should advance at least, where one alone is as dear as some.
       compiler_options: XLA options, name and value, that programs holding a step should be compiled with.
     """
 
@@ -48,6 +49,7 @@ class EnvSpec:
     deterministic: bool
     reward_confirms_goals: bool
     num_test_tasks: int = 50
+    worlds_together: int = 1
     compiler_options: tuple[tuple[str, bool], ...] = ()
 
 

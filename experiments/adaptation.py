@@ -2,7 +2,7 @@
 
 Lanes are spread over the devices and, on each, run in groups: the lanes of a group share one clock, so
 that a group's episode ends with its slowest lane. On a CPU, groups are as large as their key-value caches
-fit into the memory near a core; an episode of 500 steps has its core to itself.
+fit into the memory near a core, or as a step of the world needs to be worth its call.
 """
 
 from __future__ import annotations
@@ -53,12 +53,12 @@ class Outcome(NamedTuple):
     """CPU time of all of them, without compilation."""
 
 
-def lanes_together(config: TransformerConfig) -> int:
+def lanes_together(env: Environment, config: TransformerConfig) -> int:
     """How many lanes share a clock."""
     num_tokens = config.max_prompt_length + 2 * config.horizon - 1
     floats = 2 * config.num_layers * config.embed_dim * num_tokens
     limit = GROUP_BYTES if jax.default_backend() == "cpu" else GROUP_BYTES_ACCELERATOR
-    return max(1, limit // (4 * floats))
+    return max(env.spec.worlds_together, limit // (4 * floats))
 
 
 class Layout(NamedTuple):
@@ -70,11 +70,11 @@ class Layout(NamedTuple):
     """With those that only fill up the last groups."""
 
 
-def lay_out(config: TransformerConfig, num_lanes: int) -> Layout:
+def lay_out(env: Environment, config: TransformerConfig, num_lanes: int) -> Layout:
     """Spread at least ``num_lanes`` lanes evenly."""
     mesh = device_mesh()
     on_each = -(-num_lanes // mesh.devices.size)
-    num_groups = -(-on_each // lanes_together(config))
+    num_groups = -(-on_each // lanes_together(env, config))
     group = -(-on_each // num_groups)
     return Layout(mesh, group, mesh.devices.size * num_groups * group)
 
@@ -128,7 +128,7 @@ def evaluate_prompts(
 ) -> np.ndarray:
     """Mean greedy returns ``[S, N]`` of prompts ``[S, N, P, ..]``, one for each seed and task."""
     seeds, num = prompts.mask.shape[:2]
-    layout = lay_out(network.config, seeds * num)
+    layout = lay_out(env, network.config, seeds * num)
     index = np.arange(layout.num_lanes) % (seeds * num)
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[index], prompts)
     lane_tasks = jax.tree.map(lambda leaf: jnp.asarray(leaf)[index % num], tasks)
@@ -207,7 +207,7 @@ def run_variants(
     eval_episodes = eval_episodes or (1 if env.spec.deterministic else NUM_EVAL_EPISODES)
     keep_rewarded = keep_rewarded and env.spec.reward_confirms_goals
     lanes = len(variants) * seeds * num
-    layout = lay_out(network.config, lanes)
+    layout = lay_out(env, network.config, lanes)
     mesh, over_lanes = layout.mesh, partial(run_lanes, env, layout)
     # Lanes beyond the last variant only fill up the last group.
     index = np.arange(layout.num_lanes)

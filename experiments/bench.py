@@ -166,7 +166,7 @@ def policy_to_bench(env: Environment, dataset: Dataset) -> tuple[LoadedPolicy, s
 
 def bench_decode(env: Environment, network: LoadedPolicy, note: str) -> Iterator[Row]:
     """Time of one step of acting against the steps before it, and of a whole episode."""
-    horizon, lanes = env.spec.horizon, lanes_together(network.config)
+    horizon, lanes = env.spec.horizon, lanes_together(env, network.config)
     policy = transformer_policy(network.config, network.params)
     keys = jax.random.split(jax.random.key(0), lanes)
     tasks = jax.vmap(env.sample_task)(keys)
@@ -254,7 +254,7 @@ def main(config: BenchConfig) -> None:
     network, note = policy_to_bench(env, dataset)
     for row in bench_decode(env, network, note):
         show(row)
-    show(bench_adaptation(env, network, note, 50, 20 if config.quick else 100))
+    show(bench_adaptation(env, network, note, env.spec.num_test_tasks, 20 if config.quick else 100))
     if config.json:
         write_json(config.json, {"env": config.env, "rows": rows, **provenance()})
         print(f"rows in {config.json}", file=sys.stderr)

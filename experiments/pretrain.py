@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from envs.base import Environment
+from envs.base import Demonstrator, Environment
 from experiments.collect import CollectConfig, dataset_folder, find_demonstrator
 from experiments.collect import main as collect_main
 from experiments.configs import PretrainConfig, make_env, positive, pretrain_default
@@ -38,9 +38,11 @@ from mgpo_jax.dataset import Dataset, load_dataset
 from mgpo_jax.errors import DataError, UsageError
 from mgpo_jax.policy import transformer_policy
 from mgpo_jax.pretrain import batch_stream, make_trainer
-from mgpo_jax.prompts import single_goal
+from mgpo_jax.prompts import sample_prompt, single_goal
+from mgpo_jax.rollout import run_episode
 from mgpo_jax.sharding import device_mesh, largest_divisor
 from mgpo_jax.transformer import TransformerConfig
+from mgpo_jax.types import Prompt
 
 LANES = "lanes"
 CONSTANT = 1e-4  # standard deviation of an observation's component that does not count as varying
@@ -120,23 +122,45 @@ def prepare_dataset(config: PretrainConfig, env: Environment) -> Dataset:
 
 
 def greedy_evaluation(
-    env: Environment, network: TransformerConfig, num: int
+    env: Environment, network: TransformerConfig, demonstrator: Demonstrator, num: int
 ) -> Callable[[Any], dict[str, float]]:
-    """``params -> mean greedy return and regret of the prompt (g^M)`` on tasks of its own."""
+    """``params -> mean greedy returns`` on ``num`` tasks of its own.
+
+    ``initial`` is that of the prompt (g^M), with its regret; ``followed`` that of a prompt drawn from a
+    demonstration of the task, which says how well the policy does what a good prompt tells it.
+    """
     tasks = sample_tasks(env, EVAL_SEED, num)
     optimum = jax.jit(jax.vmap(env.optimal_return))(tasks)
+    keys = jax.random.split(jax.random.key(EVAL_SEED), num)
+    num_slots = network.max_prompt_length
 
     @jit_with(env)
-    @partial(jax.vmap, in_axes=(None, 0, 0), axis_name=LANES)
-    def returns(params: Any, key: jax.Array, task: Any) -> jax.Array:
+    @partial(jax.vmap, axis_name=LANES)
+    def demonstrated(key: jax.Array, task: Any) -> Prompt:
+        episode = run_episode(key, env, demonstrator.agent, task, LANES)
+        trajectory = episode.trajectory
+        confirmed = trajectory.goal_reached & (episode.rewards > 0)
+        kept = confirmed if env.spec.reward_confirms_goals else None
+        return sample_prompt(key, trajectory, env.task_goal(task), num_slots, kept=kept)
+
+    @jit_with(env)
+    @partial(jax.vmap, in_axes=(None, 0, 0, 0), axis_name=LANES)
+    def returns(params: Any, key: jax.Array, task: Any, prompt: Prompt) -> jax.Array:
         policy = transformer_policy(network, params)
-        prompt = single_goal(env.task_goal(task), policy.num_slots)
         return evaluate(key, env, policy, task, prompt, LANES).return_
 
+    initial = jax.vmap(lambda task: single_goal(env.task_goal(task), num_slots))(tasks)
+    followed = demonstrated(keys, tasks)
+
     def measure(params: Any) -> dict[str, float]:
-        found = returns(params, jax.random.split(jax.random.key(EVAL_SEED), num), tasks)
-        regret = jnp.mean(optimum - found)
-        return {"eval/initial_return": float(found.mean()), "eval/initial_regret": float(regret)}
+        of_initial, of_followed = (
+            returns(params, keys, tasks, prompt) for prompt in (initial, followed)
+        )
+        return {
+            "eval/initial_return": float(of_initial.mean()),
+            "eval/initial_regret": float(jnp.mean(optimum - of_initial)),
+            "eval/followed_return": float(of_followed.mean()),
+        }
 
     return measure
 
@@ -209,7 +233,8 @@ def main(config: PretrainConfig) -> None:
     )
     trainer = make_trainer(train, network, fit, mesh)
     validate = make_trainer(train, network, held_out, mesh).evaluate
-    evaluate_greedily = greedy_evaluation(env, network, config.eval_tasks)
+    _, demonstrator = find_demonstrator(env, config.data.demonstrator)
+    evaluate_greedily = greedy_evaluation(env, network, demonstrator, config.eval_tasks)
     # Two batches of one padded length: the validation loss is of the same draws every time.
     part = replace(train, batch_size=512, part_size=64, part_steps=1 << 30, bucket=env.spec.horizon)
     truncate = env.spec.truncate_in_hindsight
@@ -243,6 +268,7 @@ def main(config: PretrainConfig) -> None:
                     loss=f"{mean['train/loss']:.3f}",
                     val=f"{held['val/loss']:.3f}",
                     initial=f"{row_out['eval/initial_return']:.2f}",
+                    followed=f"{row_out['eval/followed_return']:.2f}",
                 )
                 pending, clock = [], time.process_time()
             if stopping():

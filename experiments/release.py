@@ -44,12 +44,13 @@ CARD = """# Multi-goal Transformer for {env}
 | training | {steps:,} steps of {batch_size} trajectories, {optimizer}, {cpu_minutes:.0f} CPU-minutes |
 | validation loss | {val_loss:.4f} nats an action, accuracy {val_accuracy:.4f} |
 | greedy return of the prompt (g^M) | {initial:.3f} on {eval_tasks} tasks of the training's own |
+| greedy return of a demonstration's prompt | {followed:.3f} on the same tasks |
 
 Made by
 
     {command}
 
-![loss and return of the initial prompt while training](training.png)
+![loss and greedy returns while training](training.png)
 
 Files: `weights.npz`, `config.json` (network, SHA-256 of the weights, all settings), `tasks.npz` (the
 test tasks, in no dataset), `metrics.jsonl`. Results on them are in `results/` and the README.
@@ -97,6 +98,7 @@ def main(config: ReleaseConfig) -> None:
         val_loss=last["val/loss"],
         val_accuracy=last["val/accuracy"],
         initial=last["eval/initial_return"],
+        followed=last["eval/followed_return"],
         eval_tasks=settings["eval_tasks"],
         command=" ".join(meta["command"]),
     )

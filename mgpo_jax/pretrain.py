@@ -58,6 +58,7 @@ class TrainConfig:
     """Seed of initial weights, batches, prompts and dropout."""
 
 
+HIT = 0.1  # so near to the demonstrated action, in each dimension, a prediction counts as correct
 # Root mean square of a typical AdamW update before the learning rate.
 ADAMW_RMS = 0.2
 
@@ -75,6 +76,7 @@ class Stats(NamedTuple):
 
     nll: Float[Array, "*batch"]
     correct: Float[Array, "*batch"]
+    """Actions whose likeliest prediction is the demonstrated one, within ``HIT`` in each dimension."""
     num_steps: Float[Array, "*batch"]
 
 
@@ -150,7 +152,7 @@ def bc_loss(
     )
     real = jnp.arange(len(trajectory.obs)) < trajectory.length
     nll = -jnp.sum(jnp.where(real, distribution.log_prob(trajectory.actions), 0.0))
-    hits = distribution.mode() == trajectory.actions
+    hits = jnp.abs(distribution.mode() - trajectory.actions) <= HIT
     hits = jnp.all(hits.reshape(len(real), -1), axis=1)
     correct = jnp.sum(hits & real).astype(jnp.float32)
     return nll, Stats(nll, correct, trajectory.length.astype(jnp.float32))

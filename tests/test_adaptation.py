@@ -82,7 +82,7 @@ def test_variants_differ(sweep):
 
 def test_groups_do_not_matter(maze_run, sweep, monkeypatch):
     """Not even when lanes have to be made up to fill the last group."""
-    monkeypatch.setattr(adaptation, "lanes_together", lambda config: 4)
+    monkeypatch.setattr(adaptation, "lanes_together", lambda env, config: 4)
     for small, outcome in zip(maze_run(VARIANTS), sweep, strict=True):
         assert small.num_episodes >= outcome.num_episodes
         assert_same(small._replace(num_episodes=outcome.num_episodes), outcome)

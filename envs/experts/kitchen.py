@@ -28,7 +28,7 @@ from envs.kitchen.world import (
     KitchenTask,
 )
 
-NOISE = 0.05  # standard deviation on the arm's actions
+NOISE = 0.08  # standard deviation on the arm's actions
 OPEN, CLOSED = 0.04, 0.0  # m, of each finger
 
 STIFFNESS = np.array([870, 870, 870, 870, 120, 120, 120.0])  # of the position actuators, N m / rad

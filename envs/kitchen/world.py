@@ -55,6 +55,7 @@ TARGET_LOW = (-2.9, -1.8, -2.9, -3.1, -2.9, 0.0, -2.9, 0.0, 0.0)
 TARGET_HIGH = (2.9, 1.8, 2.9, 0.0, 2.9, 3.8, 2.9, 0.04, 0.04)
 # The fusion emitters of XLA's CPU backend make MJX's batched graph hundreds of times slower.
 MJX_ON_CPU = (("xla_cpu_use_fusion_emitters", False),)
+WORLDS_TOGETHER = 8  # a call into C MuJoCo costs as much as stepping some; MJX works in vectors
 MAX_SPEED = 1e3  # of any joint; physics beyond has diverged
 
 
@@ -125,6 +126,7 @@ class Kitchen:
             deterministic=True,
             reward_confirms_goals=True,
             num_test_tasks=25,
+            worlds_together=WORLDS_TOGETHER,
             compiler_options=MJX_ON_CPU if self._is_mjx_on_cpu() else (),
         )
 

@@ -58,13 +58,20 @@ def training_curve(metrics: Path) -> Figure:
     figure = Figure(figsize=(6.4, 2.4), layout="constrained")
     panels = (
         ("loss", {"train/loss": "training", "val/loss": "held out"}),
-        ("return of the initial prompt", {"eval/initial_return": "_"}),
+        (
+            "greedy return",
+            {
+                "eval/followed_return": "prompt of a demonstration",
+                "eval/initial_return": "initial prompt",
+            },
+        ),
     )
     colors = (METHODS["bpe"][1], METHODS["ucb"][1])
     for ax, (ylabel, names) in zip(figure.subplots(1, 2), panels, strict=True):
-        for (name, label), color in zip(names.items(), colors, strict=False):
-            values = [row.get(name, np.nan) for row in rows]
-            ax.plot(steps, values, color=color, label=label, marker="o", markersize=3)
+        for (name, label), color in zip(names.items(), colors, strict=True):
+            if any(name in row for row in rows):
+                values = [row.get(name, np.nan) for row in rows]
+                ax.plot(steps, values, color=color, label=label, marker="o", markersize=3)
         ax.set(xlabel="steps", ylabel=ylabel)
-    figure.axes[0].legend()
+        ax.legend()
     return figure
