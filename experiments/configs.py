@@ -116,6 +116,7 @@ class Recipe:
     episodes: int
     max_prompt_length: int
     bucket: int
+    batch_size: int = 64
     demonstrator: str | None = None
     save_every: int = 500
     head: str | None = None
@@ -136,12 +137,13 @@ FAST = {
     ),
     # Each of the 13,600 training tasks five times.
     "gridworld": Recipe(steps=3_000, episodes=68_000, max_prompt_length=8, bucket=8),
+    # Long trajectories: half of them are enough for a gradient step.
     "kitchen": Recipe(
-        steps=5_000,
+        steps=7_000,
         episodes=9_000,
         max_prompt_length=6,
         bucket=32,
-        save_every=250,
+        batch_size=32,
         head="mixture",
         standardize_obs=True,
     ),
@@ -168,7 +170,9 @@ def pretrain_preset(env: str, preset: str) -> PretrainConfig:
         env=env,
         preset=preset,
         data=DataConfig(recipe.demonstrator, recipe.episodes),
-        train=TrainConfig(steps=recipe.steps, bucket=recipe.bucket),
+        train=TrainConfig(
+            steps=recipe.steps, batch_size=recipe.batch_size, bucket=recipe.bucket
+        ),
         max_prompt_length=recipe.max_prompt_length,
         save_every=recipe.save_every,
         head=recipe.head,

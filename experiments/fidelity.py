@@ -10,15 +10,17 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from envs.experts import demonstrators
 from envs.kitchen import SUBTASKS, Kitchen, check_extra
+from envs.kitchen.physics import PhysicsState
 from experiments.configs import positive
 from experiments.runtime import Common, jit_with, run
 from mgpo_jax.errors import UsageError
@@ -29,6 +31,8 @@ ARM, OBJECTS = slice(0, 7), slice(18, 32)
 POSITIONS, VELOCITIES = np.r_[:9, 18:39], np.r_[9:18, 39:59]
 NUM_LONGEST = 120  # tasks of all five subtasks, the last in the enumeration
 LANES = "lanes"
+# Iterations of MJX's contact solver and of its line search.
+SOLVERS = ((1, 4), (2, 4), (4, 6), (8, 10), (16, 16))
 GYMNASIUM, STOCK, REDUCED, MJX = (
     "gymnasium-robotics", "stock model, C", "reduced model, C", "reduced model, MJX"
 )  # fmt: skip
@@ -46,6 +50,8 @@ class FidelityConfig(Common):
     """Compare MJX too (compiles for half a minute on a CPU)."""
     demonstrations: int = 8
     """Demonstrations of all five subtasks on each model."""
+    solvers: bool = False
+    """Compare settings of MJX's contact solver, too (compiles for some minutes)."""
 
 
 def gymnasium_kitchen() -> Any:
@@ -166,6 +172,62 @@ def replay(episodes: Episode) -> Iterator[tuple[list[str], list[str], float]]:
         yield ours, list(info["episode_task_completions"]), error
 
 
+class Pair(NamedTuple):
+    """A state of physics and the targets of the next control step."""
+
+    physics: PhysicsState
+    ctrl: Float[Array, "9"]
+
+
+def demonstrated_states(env: Kitchen, episodes: Episode) -> Pair:
+    """All states of demonstrations but the first and last, ``[N, ..]``."""
+    from envs.kitchen.model import joint_addresses
+
+    positions, velocities = joint_addresses(env.model)
+    start, _ = env.reset(jax.random.key(0), env.task(jnp.zeros((), jnp.int32)))
+
+    def second(obs: Array, first: Array, then: Array) -> Pair:
+        """From the first state that is observed to the second, which has a warm start as well."""
+        physics = PhysicsState(
+            obs[POSITIONS][positions], obs[VELOCITIES][velocities], start.physics.warmstart
+        )
+        physics = env.physics.advance(physics, env.control(physics, first), jnp.ones((), bool))
+        return Pair(physics, env.control(physics, then))
+
+    trajectory = episodes.trajectory
+    inner = np.arange(trajectory.actions.shape[1] - 1) < trajectory.length[:, None] - 1
+    rows = (trajectory.obs[:, :-1], trajectory.actions[:, :-1], trajectory.actions[:, 1:])
+    return jax.jit(jax.vmap(second))(*(row[inner] for row in rows))
+
+
+def compare_solvers(episodes: Episode, together: int) -> Iterator[str]:
+    """One control step of MJX from every state of demonstrations, against C MuJoCo."""
+    from envs.kitchen.mjx import mjx_physics
+    from envs.kitchen.model import SUBSTEPS
+
+    env = Kitchen("kitchen", 500, "native")
+    pairs = demonstrated_states(env, episodes)
+    whole = len(pairs.ctrl) // together * together
+    pairs = jax.tree.map(lambda leaf: leaf[:whole].reshape(-1, together, *leaf.shape[1:]), pairs)
+    on = jnp.ones((), bool)
+    exact = jax.lax.map(
+        jax.vmap(lambda pair: env.physics.advance(pair.physics, pair.ctrl, on)), pairs
+    )
+    num_substeps = whole * SUBSTEPS["reduced"]
+    for iterations, line_search in SOLVERS:
+        physics = mjx_physics("reduced", iterations, line_search)
+        step = jax.vmap(lambda pair, physics=physics: physics.advance(*pair, on))
+        program = jit_with(Kitchen("kitchen", 500, "mjx"))(partial(jax.lax.map, step))
+        jax.block_until_ready(program(pairs))
+        start = time.process_time()
+        found = jax.block_until_ready(program(pairs))
+        rate = num_substeps / (time.process_time() - start)
+        error = np.abs(np.asarray(found.qpos - exact.qpos)).max(axis=-1)
+        cells = (np.median(error), *np.percentile(error, [99, 99.9]), error.max())
+        text = "".join(f"{cell:>10.0e}" for cell in cells)
+        yield f"{iterations:>4} of the solver, {line_search:>2} of its line search {text}{rate:>10.0f}"
+
+
 def main(config: FidelityConfig) -> None:
     """Compare the kitchen's models and engines with each other and with FrankaKitchen."""
     positive(config, "worlds", "steps", "demonstrations")
@@ -204,6 +266,13 @@ def main(config: FidelityConfig) -> None:
             f"the {REDUCED}",
             flush=True,
         )
+    if config.solvers:
+        head = "".join(f"{name:>10}" for name in ("median", "99 %", "99.9 %", "largest"))
+        print("\nMJX against C after one control step: largest difference of a position; substeps / CPU-s")
+        print(f"{'iterations':<42} {head}")
+        for line in compare_solvers(on_reduced, config.worlds):
+            print(line, flush=True)
+        print()
     outcomes = list(replay(on_stock))
     same = sum(ours == theirs for ours, theirs, _ in outcomes)
     error = max(error for _, _, error in outcomes)

@@ -131,7 +131,7 @@ class Head(NamedTuple):
 
 NUM_COMPONENTS = 5
 NUM_VALUES = 41
-LOG_STD_RANGE = (-5.0, 1.0)
+LOG_STD_RANGE = (-3.0, 1.0)  # a smaller spread would let the most exact dimension drown the others
 FIXED_LOG_STD = -1.0  # authors' code
 
 

@@ -19,11 +19,13 @@ from envs.kitchen.physics import Physics, PhysicsState
 ITERATIONS, LINE_SEARCH_ITERATIONS = 4, 6
 
 
-def mjx_physics(name: str) -> Physics:
+def mjx_physics(
+    name: str, iterations: int = ITERATIONS, line_search_iterations: int = LINE_SEARCH_ITERATIONS
+) -> Physics:
     """MJX with the model ``reduced``; it has no collisions of cylinders with meshes as ``stock`` needs."""
     limited = copy.copy(load_model(name))
-    limited.opt.iterations = ITERATIONS
-    limited.opt.ls_iterations = LINE_SEARCH_ITERATIONS
+    limited.opt.iterations = iterations
+    limited.opt.ls_iterations = line_search_iterations
     with jax.ensure_compile_time_eval():  # constants, also where a program is being traced
         model = mjx.put_model(limited, impl="jax")
         blank = mjx.make_data(model)

@@ -111,19 +111,31 @@ def load_model(name: str) -> mujoco.MjModel:
 def initial_state(name: str) -> PhysicsState:
     """Where every episode starts, at rest."""
     model = load_model(name)
-    positions: Any = INITIAL_POSITIONS[_addresses(model, name)[0]].astype(np.float32)
+    positions: Any = INITIAL_POSITIONS[joint_addresses(name)[0]].astype(np.float32)
     rest: Any = np.zeros(model.nv, np.float32)
     return PhysicsState(positions, rest, rest)
 
 
 def scene_coordinates(name: str) -> tuple[Coordinates, Coordinates]:
     """How the 30 positions and 29 velocities of the full scene follow from those of a model."""
-    positions, velocities = _addresses(load_model(name), name)
+    positions, velocities = joint_addresses(name)
     full = _stock_model()
     still = np.concatenate([INITIAL_POSITIONS[:-7], KETTLE_AT_REST])
     return (
         _coordinates(positions, still, full, full.jnt_qposadr),
         _coordinates(velocities, np.zeros(full.nv), full, full.jnt_dofadr),
+    )
+
+
+def joint_addresses(name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Where a model's positions and velocities are in those of the full scene."""
+    model, full = load_model(name), _stock_model()
+    if name == "stock":
+        return np.arange(full.nq), np.arange(full.nv)
+    joints = [full.joint(model.joint(index).name) for index in range(model.njnt)]
+    return (
+        np.array([joint.qposadr[0] for joint in joints]),
+        np.array([joint.dofadr[0] for joint in joints]),
     )
 
 
@@ -236,18 +248,6 @@ def _copy_actuator(full: mujoco.MjModel, index: int, spec: mujoco.MjSpec) -> Non
         ctrlrange=actuator.ctrlrange,
         forcelimited=True,
         forcerange=actuator.forcerange,
-    )
-
-
-def _addresses(model: mujoco.MjModel, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Where a model's positions and velocities are in those of the stock scene."""
-    full = _stock_model()
-    if name == "stock":
-        return np.arange(full.nq), np.arange(full.nv)
-    joints = [full.joint(model.joint(index).name) for index in range(model.njnt)]
-    return (
-        np.array([joint.qposadr[0] for joint in joints]),
-        np.array([joint.dofadr[0] for joint in joints]),
     )
 
 

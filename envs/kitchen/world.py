@@ -198,10 +198,7 @@ class Kitchen:
 
     def step(self, state: KitchenState, action: Float[Array, "9"]) -> tuple[KitchenState, TimeStep]:
         valid = jnp.all(jnp.isfinite(action))
-        shift = MAX_SHIFT * jnp.clip(jnp.where(valid, action, 0.0), -1.0, 1.0)
-        ctrl = jnp.clip(
-            state.physics.qpos[:NUM_ROBOT] + shift, jnp.array(TARGET_LOW), jnp.array(TARGET_HIGH)
-        )
+        ctrl = self.control(state.physics, jnp.where(valid, action, 0.0))
         physics = self.physics.advance(state.physics, ctrl, valid & ~state.done)
         failed = ~valid | ~_is_sane(physics)
         physics = jax.tree.map(lambda old, new: jnp.where(failed, old, new), state.physics, physics)
@@ -230,6 +227,12 @@ class Kitchen:
         after = jax.tree.map(lambda old, new: jnp.where(state.done, old, new), state, after)
         reward = jnp.where(in_order & ~state.done, 1.0 / num_subtasks, 0.0)
         return after, self._observe(after, reward, after.num_solved >= num_subtasks)
+
+    def control(self, physics: PhysicsState, action: Float[Array, "9"]) -> Float[Array, "9"]:
+        """Position targets of the actuators: an action moves them from where the joints are."""
+        shift = MAX_SHIFT * jnp.clip(action, -1.0, 1.0)
+        targets = physics.qpos[:NUM_ROBOT] + shift
+        return jnp.clip(targets, jnp.array(TARGET_LOW), jnp.array(TARGET_HIGH))
 
     def _at_target(self, physics: PhysicsState) -> Bool[Array, "S"]:
         """Which subtasks' joints are within the threshold of their targets."""
