@@ -170,9 +170,7 @@ def pretrain_preset(env: str, preset: str) -> PretrainConfig:
         env=env,
         preset=preset,
         data=DataConfig(recipe.demonstrator, recipe.episodes),
-        train=TrainConfig(
-            steps=recipe.steps, batch_size=recipe.batch_size, bucket=recipe.bucket
-        ),
+        train=TrainConfig(steps=recipe.steps, batch_size=recipe.batch_size, bucket=recipe.bucket),
         max_prompt_length=recipe.max_prompt_length,
         save_every=recipe.save_every,
         head=recipe.head,

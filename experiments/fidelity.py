@@ -268,7 +268,9 @@ def main(config: FidelityConfig) -> None:
         )
     if config.solvers:
         head = "".join(f"{name:>10}" for name in ("median", "99 %", "99.9 %", "largest"))
-        print("\nMJX against C after one control step: largest difference of a position; substeps / CPU-s")
+        print(
+            "\nMJX against C after one control step: largest difference of a position; substeps / CPU-s"
+        )
         print(f"{'iterations':<42} {head}")
         for line in compare_solvers(on_reduced, config.worlds):
             print(line, flush=True)

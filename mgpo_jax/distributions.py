@@ -131,13 +131,19 @@ class Head(NamedTuple):
 
 NUM_COMPONENTS = 5
 NUM_VALUES = 41
-LOG_STD_RANGE = (-3.0, 1.0)  # a smaller spread would let the most exact dimension drown the others
+MIN_LOG_STD = -3.0  # a smaller spread would let the most exact dimension drown the others
+MAX_LOG_STD = 1.0
 FIXED_LOG_STD = -1.0  # authors' code
+
+
+def _log_std(raw: Array) -> Array:
+    """Within bounds; near the lower one, where training goes, there is still a gradient."""
+    return jnp.minimum(MIN_LOG_STD + jax.nn.softplus(raw - MIN_LOG_STD), MAX_LOG_STD)
 
 
 def _make_gaussian(params: Array) -> Gaussian:
     mean, log_std = jnp.split(params, 2, axis=-1)
-    return Gaussian(mean, jnp.clip(log_std, *LOG_STD_RANGE))
+    return Gaussian(mean, _log_std(log_std))
 
 
 def _make_fixed_gaussian(params: Array) -> Gaussian:
@@ -147,7 +153,7 @@ def _make_fixed_gaussian(params: Array) -> Gaussian:
 def _make_mixture(params: Array) -> Mixture:
     logits, rest = params[..., :NUM_COMPONENTS], params[..., NUM_COMPONENTS:]
     rest = rest.reshape(*rest.shape[:-1], 2, NUM_COMPONENTS, -1)
-    return Mixture(logits, rest[..., 0, :, :], jnp.clip(rest[..., 1, :, :], *LOG_STD_RANGE))
+    return Mixture(logits, rest[..., 0, :, :], _log_std(rest[..., 1, :, :]))
 
 
 def _make_binned(params: Array) -> Binned:

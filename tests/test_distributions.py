@@ -166,9 +166,13 @@ def test_heads_turn_their_parameters_into_a_distribution(name, num_params):
 
 
 def test_gaussian_heads_bound_their_spread():
-    distribution = HEADS["gaussian"].make(jnp.array([0.7, -40.0, -90.0, 90.0]))
-    np.testing.assert_array_equal(distribution.log_std, [-5.0, 1.0])
+    make = HEADS["gaussian"].make
+    distribution = make(jnp.array([0.7, -40.0, -90.0, 90.0]))
+    np.testing.assert_allclose(distribution.log_std, [-3.0, 1.0])
     assert np.isfinite(distribution.log_prob(jnp.array([1.0, -1.0])))
+    # Near the bound there is still a way back.
+    slope = jax.grad(lambda params: make(params).log_std.sum())(jnp.array([0.0, 0.0, -5.0, 0.0]))
+    assert (slope[2:] > 0.1).all()
     fixed = HEADS["fixed_gaussian"].make(jnp.array([0.7, -40.0]))
     np.testing.assert_allclose(fixed.mean, np.tanh([0.7, -40.0]), rtol=1e-5)
     np.testing.assert_array_equal(fixed.log_std, [-1.0, -1.0])
