@@ -117,6 +117,7 @@ class Recipe:
     max_prompt_length: int
     bucket: int
     batch_size: int = 64
+    part_steps: int = 1024
     demonstrator: str | None = None
     save_every: int = 500
     head: str | None = None
@@ -139,11 +140,12 @@ FAST = {
     "gridworld": Recipe(steps=3_000, episodes=68_000, max_prompt_length=8, bucket=8),
     # Long trajectories: half of them are enough for a gradient step.
     "kitchen": Recipe(
-        steps=7_000,
+        steps=6_000,
         episodes=9_000,
         max_prompt_length=6,
         bucket=32,
         batch_size=32,
+        part_steps=2048,
         head="mixture",
         standardize_obs=True,
     ),
@@ -170,7 +172,12 @@ def pretrain_preset(env: str, preset: str) -> PretrainConfig:
         env=env,
         preset=preset,
         data=DataConfig(recipe.demonstrator, recipe.episodes),
-        train=TrainConfig(steps=recipe.steps, batch_size=recipe.batch_size, bucket=recipe.bucket),
+        train=TrainConfig(
+            steps=recipe.steps,
+            batch_size=recipe.batch_size,
+            part_steps=recipe.part_steps,
+            bucket=recipe.bucket,
+        ),
         max_prompt_length=recipe.max_prompt_length,
         save_every=recipe.save_every,
         head=recipe.head,
