@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
@@ -13,8 +14,15 @@ import mgpo_jax.rollout
 from envs.grid_world import GridWorld
 from envs.maze_runner import MazeRunner
 from envs.noisy import Noisy
+from envs.wrapper import Wrapper
 from experiments import adaptation
-from experiments.adaptation import evaluate_prompts, run_adaptation, run_variants
+from experiments.adaptation import (
+    evaluate_prompts,
+    lanes_together,
+    lay_out,
+    run_adaptation,
+    run_variants,
+)
 from experiments.policies import LoadedPolicy
 from experiments.tasks import sample_tasks
 from mgpo_jax.checkpoint import network_config
@@ -86,6 +94,25 @@ def test_groups_do_not_matter(maze_run, sweep, monkeypatch):
     for small, outcome in zip(maze_run(VARIANTS), sweep, strict=True):
         assert small.num_episodes >= outcome.num_episodes
         assert_same(small._replace(num_episodes=outcome.num_episodes), outcome)
+
+
+@dataclass(frozen=True)
+class InGroups(Wrapper):
+    """A world that is stepped in groups of ``num``."""
+
+    num: int = 1
+
+    @property
+    def spec(self):
+        return replace(self.env.spec, worlds_together=self.num)
+
+
+def test_a_world_may_ask_for_company():
+    config = untrained(MAZE).config
+    alone = lanes_together(MAZE, config)
+    assert lanes_together(InGroups(MAZE, 1), config) == alone
+    assert lanes_together(InGroups(MAZE, alone + 5), config) == alone + 5
+    assert lay_out(InGroups(MAZE, 1000), config, 60).group == 30  # two devices
 
 
 def test_a_run_is_a_sweep_of_one(sweep):
