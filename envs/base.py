@@ -66,6 +66,8 @@ class TimeStep(NamedTuple):
     reward: Float[Array, ""]
     terminated: Bool[Array, ""]
     truncated: Bool[Array, ""]
+    failed: Bool[Array, ""] | bool = False
+    """Whether the world broke down (diverged physics) and ended the episode because of that."""
 
 
 @runtime_checkable

@@ -112,6 +112,7 @@ def summarize(config: AdaptConfig, outcome: Outcome, optimum: np.ndarray) -> dic
         "regret_std_over_seeds": seed_spread(regret).std,
         "regret_after_40": at_40,
         "solved_optimally": float((regret < 1e-4).mean()),
+        "failed_episodes": int(outcome.log.failed.sum()),
         "best_episode_return": float(outcome.log.returns.max(axis=-1).mean()),
         "cpu_seconds": outcome.cpu_seconds,
         "episodes_per_cpu_second": outcome.num_episodes / outcome.cpu_seconds,
@@ -121,7 +122,7 @@ def summarize(config: AdaptConfig, outcome: Outcome, optimum: np.ndarray) -> dic
 def table(summary: dict[str, Any]) -> str:
     """The printed result."""
     low, high = summary["final_return_iqm_95"]
-    after_40 = summary["regret_after_40"]
+    after_40, failed = summary["regret_after_40"], summary["failed_episodes"]
     rows = [
         ("initial return", f"{summary['initial_return']:.3f}"),
         (
@@ -134,6 +135,7 @@ def table(summary: dict[str, Any]) -> str:
         ("regret", f"{summary['regret']:.3f} ± {summary['regret_std_over_seeds']:.3f}"),
         ("  after 40", "-" if after_40 is None else f"{after_40:.3f}"),
         ("solved optimally", f"{100 * summary['solved_optimally']:.0f} %"),
+        *[("failed episodes", f"{failed} (the world broke down)")] * (failed > 0),
         (
             "speed",
             f"{summary['episodes_per_cpu_second']:.0f} episodes per CPU-second"

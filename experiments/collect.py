@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
@@ -60,7 +61,7 @@ def find_demonstrator(env: Environment, policy: str | None) -> tuple[str, Demons
 
 @cache
 def demonstration_program(env: Environment, demonstrator: Demonstrator) -> Any:
-    """``(keys, indices) -> (task fingerprints, trajectories, hindsight returns, which to keep)``.
+    """``(keys, indices) -> (task fingerprints, trajectories, hindsight returns, which to keep, failed)``.
 
     Compiled once a process.
     """
@@ -69,12 +70,13 @@ def demonstration_program(env: Environment, demonstrator: Demonstrator) -> Any:
     @partial(jax.vmap, axis_name=LANES)
     def demonstrate(
         key: jax.Array, index: jax.Array
-    ) -> tuple[jax.Array, Trajectory, jax.Array, jax.Array]:
+    ) -> tuple[jax.Array, Trajectory, jax.Array, jax.Array, jax.Array]:
         key_task, key_episode = jax.random.split(key)
         task = demonstrator.sample_task(key_task, index)
         episode = run_episode(key_episode, env, demonstrator.agent, task, LANES)
         return_ = demonstrator.hindsight_return(episode.trajectory)
-        return env.fingerprint(task), episode.trajectory, return_, demonstrator.keeps(episode)
+        keep, failed = demonstrator.keeps(episode), jnp.asarray(episode.failed)
+        return env.fingerprint(task), episode.trajectory, return_, keep & ~failed, failed
 
     return demonstrate
 
@@ -90,14 +92,14 @@ def collect(
     demonstrate = demonstration_program(env, demonstrator)
     forbidden = task_hashes(env, benchmark_tasks(env))
     kept: list[tuple[Any, ...]] = []
-    num_kept = num_test = batch = 0
+    num_kept = num_test = num_failed = batch = 0
     fresh, again, num_again = count(), np.zeros(0, int), 0
     with tqdm(total=episodes, unit="episode", disable=None) as progress:
         while num_kept < episodes:
             keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), batch), BATCH)
             new = list(islice(fresh, BATCH - len(again)))
             indices = np.concatenate([again, new]).astype(np.int32)
-            prints, trajectory, returns, good = jax.device_get(demonstrate(keys, indices))
+            prints, trajectory, returns, good, failed = jax.device_get(demonstrate(keys, indices))
             hashes = np.array([hash_task(one) for one in prints], np.uint64)
             unseen = ~np.isin(hashes, forbidden)
             again = indices[unseen & ~good]
@@ -107,6 +109,7 @@ def collect(
             kept.append((*steps, trajectory.length[rows], hashes[rows], returns[rows]))
             num_kept += len(rows)
             num_again += len(again)
+            num_failed += int(failed.sum())
             num_test += int((~unseen).sum())
             batch += 1
             progress.update(len(rows))
@@ -116,6 +119,7 @@ def collect(
         raise AssertionError("a test task is in the dataset")
     facts = {
         "tried_again": num_again,
+        "failed_episodes": num_failed,
         "dropped_test_tasks": num_test,
         "length": _describe(dataset.lengths),
         "at_horizon": float(np.mean(dataset.lengths == env.spec.horizon)),

@@ -32,6 +32,8 @@ class AdaptLog(NamedTuple):
     """What happened in N consecutive episodes."""
 
     returns: Float[Array, "*batch N"]
+    failed: Bool[Array, "*batch N"]
+    """Whether the world broke down."""
     greedy: Bool[Array, "*batch N"]
     prompts: Prompt
     """The prompts that were run, [N, P, ..]."""
@@ -75,7 +77,13 @@ def continue_adaptation(
         query, asked = optimizer.ask(key_ask, state.optimizer)
         result = rollout(key_rollout, env, policy, task, query, axis_name)
         told = optimizer.tell(asked, query, result)
-        log = AdaptLog(result.return_, query.greedy, query.prompt, optimizer.best(told))
+        log = AdaptLog(
+            result.return_,
+            jnp.asarray(result.failed),
+            query.greedy,
+            query.prompt,
+            optimizer.best(told),
+        )
         return AdaptState(key, told), log
 
     return jax.lax.scan(episode, state, length=num_episodes)

@@ -150,4 +150,4 @@ def run_episode(
         loop = jax.lax.while_loop(
             lambda loop, end=end: loop.anyone_alive & (loop.time < end), advance, loop
         )
-    return Episode(loop.record, loop.rewards, loop.return_)
+    return Episode(loop.record, loop.rewards, loop.return_, loop.timestep.failed)

@@ -50,3 +50,5 @@ class Episode(NamedTuple):
     rewards: Float[Array, "*batch T"]
     return_: Float[Array, "*batch"]
     """Undiscounted sum of rewards."""
+    failed: Bool[Array, "*batch"] | bool = False
+    """Whether the world broke down and ended it."""

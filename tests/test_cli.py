@@ -243,6 +243,7 @@ def test_adapt_writes_what_it_prints(
     assert summary["num_seeds"] == 2
     assert summary["num_episodes"] == 5
     assert summary["initial_return"] == pytest.approx(raw["returns"][:, :, 0].mean())
+    assert summary["failed_episodes"] == 0
     assert summary["final_return"] == pytest.approx(raw["eval_returns"][:, :, -1].mean())
     assert summary["regret"] == pytest.approx(
         (raw["optimal_returns"] - raw["eval_returns"][:, :, -1]).mean()

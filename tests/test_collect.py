@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 import envs
 from envs.experts import demonstrators
+from envs.wrapper import Wrapper
 from experiments.collect import collect
 from experiments.tasks import benchmark_tasks, task_hashes
 
@@ -27,3 +30,21 @@ def test_tasks_in_turn_are_demonstrated_equally_often() -> None:
     tests = np.isin(task_hashes(WORLD, benchmark_tasks(WORLD)), dataset.task_hashes)
     assert not tests.any()
     assert counts.max() - counts.min() <= 6, counts
+
+
+@dataclass(frozen=True)
+class Breaking(Wrapper):
+    """Breaks down when an episode lasts 40 steps."""
+
+    def step(self, state, action):
+        state, timestep = self.env.step(state, action)
+        failed = state.steps >= 40
+        return state, timestep._replace(truncated=timestep.truncated | failed, failed=failed)
+
+
+def test_episodes_of_broken_worlds_are_counted_not_kept() -> None:
+    demonstrator = demonstrators(WORLD)["expert"]
+    dataset, facts = collect(Breaking(WORLD), demonstrator, 500, seed=0)
+    assert len(dataset) == 500
+    assert dataset.lengths.max() < 40
+    assert facts["failed_episodes"] == facts["tried_again"] > 10

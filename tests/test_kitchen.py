@@ -267,6 +267,7 @@ class TestBadInput:
         after, steps = step_many(broken, jnp.zeros((num, 9)))
         np.testing.assert_array_equal(after.failed, bad)
         np.testing.assert_array_equal(steps.truncated, bad)
+        np.testing.assert_array_equal(steps.failed, bad)
         assert (steps.reward == 0).all()
         assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(after.physics))
         alone, _ = stepper(WORLD)(begin([LIGHT]), jnp.zeros(9))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,7 @@ from scipy import special, stats
 import mgpo_jax.rollout
 from envs.base import Agent
 from envs.maze_runner import EAST, NORTH, STAY, WEST, MazeRunner, MazeTask
+from envs.wrapper import Wrapper
 from mgpo_jax.policy import transformer_policy
 from mgpo_jax.rollout import prompted, rollout, run_episode
 from mgpo_jax.transformer import GoalTransformer, TransformerConfig
@@ -112,6 +115,40 @@ def test_an_episode_ends_by_quitting_or_at_the_horizon(quits_at, length):
     assert float(episode.return_) == pytest.approx(-0.1 * length)
     np.testing.assert_array_equal(episode.trajectory.goal_reached, np.arange(12) < length)
     assert not np.asarray(episode.trajectory.obs[length:]).any()
+
+
+@dataclass(frozen=True)
+class Fragile(Wrapper):
+    """Breaks down at the first step to the west."""
+
+    def reset(self, key, task):
+        state, timestep = self.env.reset(key, task)
+        whole = jnp.zeros((), bool)
+        return (whole, state), timestep._replace(failed=whole)
+
+    def step(self, state, action):
+        broken, inner = state
+        broken |= action == WEST
+        inner, timestep = self.env.step(inner, action)
+        truncated = timestep.truncated | broken
+        return (broken, inner), timestep._replace(truncated=truncated, failed=broken)
+
+
+def test_a_world_that_breaks_down_ends_its_episode_alone():
+    def play(second):
+        def act(step):
+            action = jnp.where(step == 1, second, NORTH)
+            return action, jnp.zeros((), bool), step + 1
+
+        agent = Agent(
+            lambda key, task, state, timestep: act(jnp.int32(0)),
+            lambda key, memory, state, timestep: act(memory),
+        )
+        return run_episode(jax.random.key(0), Fragile(ENV), agent, task_to(5, 5), "lanes")
+
+    episodes = jax.vmap(play, axis_name="lanes")(jnp.array([EAST, WEST, NORTH]))
+    np.testing.assert_array_equal(episodes.failed, [False, True, False])
+    np.testing.assert_array_equal(episodes.trajectory.length, [12, 2, 12])
 
 
 def test_lanes_equal_single_runs():

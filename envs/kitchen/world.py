@@ -257,6 +257,7 @@ class Kitchen:
             reward=reward,
             terminated=complete,
             truncated=((state.steps >= self.horizon) | state.failed) & ~complete,
+            failed=state.failed,
         )
 
 
