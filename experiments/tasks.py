@@ -40,6 +40,16 @@ def benchmark_tasks(env: Environment, num: int | None = None) -> Task:
     return jax.tree.map(lambda leaf: leaf[chosen], drawn)
 
 
+def evaluation_tasks(env: Environment, num: int) -> Task:
+    """Tasks to watch a training by: none of them is a test task."""
+    drawn = sample_tasks(env, EVAL_SEED, 2 * num)
+    allowed = ~np.isin(task_hashes(env, drawn), task_hashes(env, benchmark_tasks(env)))
+    chosen = np.flatnonzero(allowed)[:num]
+    if len(chosen) < num:
+        raise ValueError(f"{env.spec.name} has too few tasks to evaluate on {num} others")
+    return jax.tree.map(lambda leaf: leaf[chosen], drawn)
+
+
 def task_hashes(env: Environment, tasks: Task) -> np.ndarray:
     """A hash of each task's fingerprint, [N] uint64."""
     prints = np.asarray(jax.vmap(env.fingerprint)(tasks))

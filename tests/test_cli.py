@@ -206,7 +206,7 @@ def test_resumed_run_equals_an_uninterrupted_one(
         for run in (RUN, Path("second"))
     ]
     assert [row["step"] for row in rows[0]] == [row["step"] for row in rows[1]] == [3, 6]
-    for name in ("train/loss", "val/loss", "eval/initial_return", "eval/followed_return"):
+    for name in ("train/loss", "val/loss", "eval/initial_return"):
         assert rows[0][0][name] == rows[1][0][name]
     assert rows[0][1]["val/loss"] == rows[1][1]["val/loss"]
 
