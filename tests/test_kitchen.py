@@ -238,6 +238,12 @@ class TestBadInput:
         ):
             extra.check_extra()
 
+    def test_an_old_pair(self, monkeypatch, tmp_path):
+        monkeypatch.setattr(extra, "version", lambda name: "3.3.0")
+        monkeypatch.setattr(extra, "_folders", lambda module: [tmp_path])
+        with pytest.raises(MissingExtraError, match=r"mujoco 3\.3\.0 is too old .* pip install"):
+            extra.check_extra()
+
     def test_missing_files(self, monkeypatch):
         monkeypatch.setattr(extra, "SCENE", extra.Path("nowhere.xml"))
         with pytest.raises(MissingExtraError, match=r"no kitchen scene \(nowhere.xml\)"):
@@ -307,10 +313,11 @@ class TestNative:
                 np.testing.assert_allclose(obs[world, step, :9], data.qpos[:9], atol=1e-4)
 
     @pytest.mark.skipif(jax.device_count() < 2, reason="needs two devices")
-    def test_two_devices(self):
+    @pytest.mark.parametrize(("lanes", "steps"), [(24, 30), (2000, 2)])
+    def test_two_devices(self, lanes, steps):
         """Each runs its own part of the lanes, as in adaptation, and calls at the same time."""
         spec = PartitionSpec("data")
-        actions = random_actions(4, 24, 30)
+        actions = random_actions(4, lanes, steps)
         state = jax.tree.map(jnp.asarray, begin([LIGHT]))
 
         def play(rows):

@@ -28,16 +28,18 @@ def check_extra() -> None:
             f"mujoco {mujoco} and mujoco-mjx {mjx} do not match: the kitchen needs one version of "
             f"both; {INSTALL} installs a pair that works"
         )
+    if not any((folder / "batch.py").is_file() for folder in _folders("mujoco")):
+        raise MissingExtraError(
+            f"mujoco {mujoco} is too old to step many worlds at once; {INSTALL} installs one that can"
+        )
     scene_path()
 
 
 def scene_path() -> Path:
     """The scene's main file in the installed gymnasium-robotics."""
     _installed_version("gymnasium-robotics")
-    spec = importlib.util.find_spec("gymnasium_robotics")
-    folders = list(spec.submodule_search_locations or ()) if spec else []
-    for folder in folders:
-        if (path := Path(folder) / SCENE).is_file():
+    for folder in _folders("gymnasium_robotics"):
+        if (path := folder / SCENE).is_file():
             return path
     raise MissingExtraError(
         f"gymnasium-robotics has no kitchen scene ({SCENE}); reinstall it with {INSTALL}"
@@ -49,3 +51,9 @@ def _installed_version(package: str) -> str:
         return version(package)
     except PackageNotFoundError:
         raise MissingExtraError(f"the kitchen needs {package}: {INSTALL}") from None
+
+
+def _folders(module: str) -> list[Path]:
+    """Where an installed module is, without importing it."""
+    spec = importlib.util.find_spec(module)
+    return [Path(folder) for folder in (spec.submodule_search_locations or ())] if spec else []
