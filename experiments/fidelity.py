@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 from envs.experts import demonstrators
 from envs.kitchen import SUBTASKS, Kitchen, check_extra
 from envs.kitchen.physics import PhysicsState
+from envs.kitchen.world import POSITIONS, VELOCITIES
 from experiments.configs import positive
 from experiments.runtime import Common, jit_with, run
 from mgpo_jax.errors import UsageError
@@ -28,7 +29,6 @@ from mgpo_jax.rollout import run_episode
 from mgpo_jax.types import Episode
 
 ARM, OBJECTS = slice(0, 7), slice(18, 32)
-POSITIONS, VELOCITIES = np.r_[:9, 18:39], np.r_[9:18, 39:59]
 NUM_LONGEST = 120  # tasks of all five subtasks, the last in the enumeration
 LANES = "lanes"
 # Iterations of MJX's contact solver and of its line search.

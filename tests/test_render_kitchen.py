@@ -10,7 +10,8 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from envs.render.kitchen import POSITIONS, kitchen_frames
+from envs.kitchen.world import POSITIONS
+from envs.render.kitchen import kitchen_frames
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -18,7 +19,7 @@ DRAW = """
 import sys, numpy as np
 from envs.render.kitchen import Panel, kitchen_gif
 from envs.kitchen.model import INITIAL_POSITIONS
-from envs.render.kitchen import POSITIONS
+from envs.kitchen.world import POSITIONS
 obs = np.zeros((3, 59))
 obs[:, POSITIONS] = INITIAL_POSITIONS
 obs[2, 31] = -1.5  # microwave

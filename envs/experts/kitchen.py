@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from envs.base import Agent, Demonstrator, TimeStep
+from envs.kitchen.physics import CONTROL_PERIOD
 from envs.kitchen.world import (
     MAX_SHIFT,
     NUM_ROBOT,
@@ -32,8 +33,8 @@ NOISE = 0.08  # standard deviation on the arm's actions
 OPEN, CLOSED = 0.04, 0.0  # m, of each finger
 
 STIFFNESS = np.array([870, 870, 870, 870, 120, 120, 120.0])  # of the position actuators, N m / rad
-# What a step moves a joint is a part of what its target moves: 1 - exp(-0.08 s stiffness / damping).
-REACH = 1 - np.exp(-0.08 * STIFFNESS / np.array([100, 100, 100, 100, 10, 10, 10.0]))
+# What a step moves a joint is a part of what its target moves.
+REACH = 1 - np.exp(-CONTROL_PERIOD * STIFFNESS / np.array([100, 100, 100, 100, 10, 10, 10.0]))
 # A little inside of the joints' ranges and of the targets' bounds.
 LOW = np.array([-2.85, -1.755, -2.85, -3.02, -2.85, 0.02, -2.85])
 HIGH = np.array([2.85, 1.72, 2.85, -0.45, 2.85, 2.09, 2.85])

@@ -23,11 +23,9 @@ import mujoco
 import numpy as np
 
 from envs.kitchen.extra import check_extra, scene_path
-from envs.kitchen.physics import Coordinates, PhysicsState
+from envs.kitchen.physics import CONTROL_PERIOD, Coordinates, PhysicsState
 
-MODELS = ("reduced", "stock")
 SUBSTEPS = {"reduced": 10, "stock": 40}
-CONTROL_PERIOD = 0.08  # s
 
 ARM_JOINTS = tuple(f"robot:panda0_joint{number}" for number in range(1, 8))
 FINGER_JOINTS = ("robot:panda0_finger_joint1", "robot:panda0_finger_joint2")

@@ -18,6 +18,8 @@ from jaxtyping import Array, Bool, Float, Int
 from envs.kitchen.extra import check_extra
 
 BACKENDS = ("auto", "native", "mjx")
+MODELS = ("reduced", "stock")
+CONTROL_PERIOD = 0.08  # s
 
 
 class PhysicsState(NamedTuple):

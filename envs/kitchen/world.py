@@ -27,6 +27,8 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from envs.base import EnvSpec, TimeStep
 from envs.kitchen.physics import (
     BACKENDS,
+    CONTROL_PERIOD,
+    MODELS,
     Physics,
     PhysicsState,
     load_physics,
@@ -48,8 +50,10 @@ TARGETS = (
 )
 THRESHOLD = 0.3
 NUM_POSITIONS, NUM_ROBOT, OBS_DIM = 30, 9, 59
+# Where they are in an observation: positions and velocities of the robot, then of the objects.
+POSITIONS, VELOCITIES = np.r_[:9, 18:39], np.r_[9:18, 39:59]
 
-MAX_SHIFT = 2.0 * 0.08  # action scale times control period (FrankaRobot: act_rng, dt)
+MAX_SHIFT = 2.0 * CONTROL_PERIOD  # action scale times control period (FrankaRobot: act_rng, dt)
 # Bounds of the position targets (franka_config.xml), rad and m.
 TARGET_LOW = (-2.9, -1.8, -2.9, -3.1, -2.9, 0.0, -2.9, 0.0, 0.0)
 TARGET_HIGH = (2.9, 1.8, 2.9, 0.0, 2.9, 3.8, 2.9, 0.04, 0.04)
@@ -104,8 +108,8 @@ class Kitchen:
             raise ValueError(
                 f"backend must be one of {', '.join(BACKENDS)}, found {self.backend!r}"
             )
-        if self.model not in ("reduced", "stock"):
-            raise ValueError(f"model must be reduced or stock, found {self.model!r}")
+        if self.model not in MODELS:
+            raise ValueError(f"model must be {' or '.join(MODELS)}, found {self.model!r}")
         if self.backend == "mjx" and self.model == "stock":
             raise ValueError(
                 "MJX has no collisions of cylinders with meshes and boxes, which the stock model "

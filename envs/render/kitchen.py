@@ -10,11 +10,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.figure import Figure
 
+from envs.kitchen.world import POSITIONS
 from envs.render.palette import INK, PAPER
 from envs.render.video import write_gif
 
-NUM_ROBOT = 9
-POSITIONS = np.r_[:NUM_ROBOT, 2 * NUM_ROBOT : 39]  # places of the 30 positions in an observation
 DPI, ABOVE, BELOW = 100, 34, 18  # pixels an inch; pixels of text above and below a picture
 FRAMES = 75  # of a GIF
 GAP = 0.01  # between pictures, as a share of the width
