@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import Counter
 from dataclasses import dataclass
 from functools import cache, partial
 from itertools import count, islice
@@ -21,11 +22,12 @@ from experiments.configs import data_root, make_env, positive
 from experiments.runtime import Common, jit_with, refuse_existing, run, versions
 from experiments.tasks import benchmark_tasks, task_hashes
 from mgpo_jax.dataset import Dataset, hash_task, save_dataset
-from mgpo_jax.errors import nearest
+from mgpo_jax.errors import DataError, nearest
 from mgpo_jax.rollout import run_episode
 from mgpo_jax.types import Trajectory
 
 LANES = "lanes"
+MAX_TRIES = 20  # at one demonstration
 BATCH = 250  # episodes at once: enough to fill the vector units, few enough to stay in cache
 
 
@@ -47,7 +49,7 @@ class CollectConfig(Common):
 
 def dataset_folder(config: CollectConfig, policy: str) -> Path:
     name = f"{policy}-{config.episodes}-seed{config.seed}"
-    return config.out or data_root() / config.env / name
+    return config.out or data_root() / make_env(config.env).spec.name / name
 
 
 def find_demonstrator(env: Environment, policy: str | None) -> tuple[str, Demonstrator]:
@@ -88,12 +90,16 @@ def collect(
 
     Those that are not worth keeping are tried again with another key, so that a demonstrator that goes
     through all tasks in turn demonstrates each of them equally often, but for the last batch.
+
+    Raises:
+      DataError: if the demonstrator fails ``MAX_TRIES`` times at one of them.
     """
     demonstrate = demonstration_program(env, demonstrator)
     forbidden = task_hashes(env, benchmark_tasks(env))
     kept: list[tuple[Any, ...]] = []
     num_kept = num_test = num_failed = batch = 0
     fresh, again, num_again = count(), np.zeros(0, int), 0
+    tries: Counter[int] = Counter()
     with tqdm(total=episodes, unit="episode", disable=None) as progress:
         while num_kept < episodes:
             keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), batch), BATCH)
@@ -103,6 +109,11 @@ def collect(
             hashes = np.array([hash_task(one) for one in prints], np.uint64)
             unseen = ~np.isin(hashes, forbidden)
             again = indices[unseen & ~good]
+            tries.update(again.tolist())
+            if tries and (worst := tries.most_common(1)[0])[1] >= MAX_TRIES:
+                raise DataError(
+                    f"the demonstrator failed {MAX_TRIES} times at task {worst[0]} of {env.spec.name}"
+                )
             rows = np.flatnonzero(unseen & good)[: episodes - num_kept]
             real = np.arange(trajectory.goal_reached.shape[1]) < trajectory.length[rows, None]
             steps = [np.asarray(array)[rows][real] for array in trajectory[:-1]]

@@ -11,7 +11,7 @@ class UsageError(Exception):
 
 
 class DataError(Exception):
-    """A file is missing, damaged or does not fit (command lines exit with 1)."""
+    """Data is missing, damaged, does not fit or cannot be made (command lines exit with 1)."""
 
 
 def nearest(name: str, known: Iterable[str], what: str) -> UsageError:

@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 
 import envs
 from envs.experts import demonstrators
 from envs.wrapper import Wrapper
 from experiments.collect import collect
 from experiments.tasks import benchmark_tasks, task_hashes
+from mgpo_jax.errors import DataError
 
 WORLD = envs.make("gridworld")
 FIRST = 5000  # of the tasks below
@@ -34,17 +36,29 @@ def test_tasks_in_turn_are_demonstrated_equally_often() -> None:
 
 @dataclass(frozen=True)
 class Breaking(Wrapper):
-    """Breaks down when an episode lasts 40 steps."""
+    """Breaks down when an episode lasts 30 steps."""
 
     def step(self, state, action):
         state, timestep = self.env.step(state, action)
-        failed = state.steps >= 40
+        failed = state.steps >= 30
         return state, timestep._replace(truncated=timestep.truncated | failed, failed=failed)
 
 
 def test_episodes_of_broken_worlds_are_counted_not_kept() -> None:
-    demonstrator = demonstrators(WORLD)["expert"]
+    """Of tasks of three objects, most of which take fewer steps."""
+    demonstrator = demonstrators(WORLD)["expert"]._replace(
+        sample_task=lambda key, index: WORLD.task(index % 200)
+    )
     dataset, facts = collect(Breaking(WORLD), demonstrator, 500, seed=0)
     assert len(dataset) == 500
-    assert dataset.lengths.max() < 40
+    assert dataset.lengths.max() < 30
     assert facts["failed_episodes"] == facts["tried_again"] > 10
+
+
+def test_a_task_that_cannot_be_demonstrated_is_an_error() -> None:
+    demonstrator = demonstrators(WORLD)["expert"]._replace(
+        sample_task=lambda key, index: WORLD.task(index),
+        keeps=lambda episode: episode.trajectory.length < 5,
+    )
+    with pytest.raises(DataError, match=r"failed 20 times at task [0-9]+ of gridworld"):
+        collect(WORLD, demonstrator, 500, seed=0)
