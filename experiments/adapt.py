@@ -56,7 +56,7 @@ class AdaptConfig(Common):
     """Folder of a policy (default: the released one of the world)."""
     tasks: Path | None = None
     """Your own tasks, an npz file; mazes: maze [N, S, S] with 1 = wall, goal [N, 2] row and column
-    (default: the 50 test tasks of the world)."""
+    (default: the test tasks of the world)."""
     seeds: int = 3
     """Independent adaptations to each task [3]."""
     episodes: int = 100
@@ -112,7 +112,7 @@ def summarize(config: AdaptConfig, outcome: Outcome, optimum: np.ndarray) -> dic
         "regret_std_over_seeds": seed_spread(regret).std,
         "regret_after_40": at_40,
         "solved_optimally": float((regret < 1e-4).mean()),
-        "failed_episodes": int(outcome.log.failed.sum()),
+        "failed_episodes": outcome.num_failed,
         "best_episode_return": float(outcome.log.returns.max(axis=-1).mean()),
         "cpu_seconds": outcome.cpu_seconds,
         "episodes_per_cpu_second": outcome.num_episodes / outcome.cpu_seconds,

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from tqdm import tqdm
 
 from envs.base import Environment, Task
@@ -49,6 +49,8 @@ class Outcome(NamedTuple):
     the first is that of the prompt (g^M)."""
     num_episodes: int
     """All episodes that were run, searches and evaluations."""
+    num_failed: int
+    """Those that the world ended because it broke down."""
     cpu_seconds: float
     """CPU time of all of them, without compilation."""
 
@@ -99,7 +101,16 @@ def run_lanes(env: Environment, layout: Layout, function: Callable) -> Any:
     return jit_with(env)(call)
 
 
-def mean_greedy_return(
+class Measured(NamedTuple):
+    """Greedy episodes under a prompt."""
+
+    return_: Float[Array, "*lanes"]
+    """Their mean."""
+    num_failed: Int[Array, "*lanes"]
+    """How many the world ended because it broke down."""
+
+
+def measure_prompt(
     env: Environment,
     config: TransformerConfig,
     num_episodes: int,
@@ -107,14 +118,16 @@ def mean_greedy_return(
     task: Task,
     prompt: Prompt,
     params: Any,
-) -> Float[Array, ""]:
-    """Of episodes under a prompt, outside of any search."""
+) -> Measured:
+    """What a prompt is worth, outside of any search."""
     policy = transformer_policy(config, params)
-    returns = jax.lax.map(
-        lambda key: evaluate(key, env, policy, task, prompt, LANES).return_,
-        jax.random.split(key, num_episodes),
-    )
-    return returns.mean()
+
+    def episode(key: PRNGKeyArray) -> tuple[Array, Array]:
+        done = evaluate(key, env, policy, task, prompt, LANES)
+        return done.return_, jnp.asarray(done.failed)
+
+    returns, failed = jax.lax.map(episode, jax.random.split(key, num_episodes))
+    return Measured(returns.mean(), failed.sum())
 
 
 def evaluate_prompts(
@@ -125,18 +138,22 @@ def evaluate_prompts(
     *,
     episodes: int,
     seed: int = 0,
-) -> np.ndarray:
-    """Mean greedy returns ``[S, N]`` of prompts ``[S, N, P, ..]``, one for each seed and task."""
+) -> tuple[np.ndarray, int]:
+    """Mean greedy returns ``[S, N]`` of prompts ``[S, N, P, ..]``, one for each seed and task.
+
+    The second result is how many episodes a broken world ended.
+    """
     seeds, num = prompts.mask.shape[:2]
     layout = lay_out(env, network.config, seeds * num)
     index = np.arange(layout.num_lanes) % (seeds * num)
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[index], prompts)
     lane_tasks = jax.tree.map(lambda leaf: jnp.asarray(leaf)[index % num], tasks)
     keys = jax.random.split(jax.random.key(seed), seeds * num)[index]
-    measure = run_lanes(env, layout, partial(mean_greedy_return, env, network.config, episodes))
+    measure = run_lanes(env, layout, partial(measure_prompt, env, network.config, episodes))
     lanes = split(layout.mesh, (keys, lane_tasks, flat))
-    returns = measure(*lanes, replicate(layout.mesh, network.params))
-    return np.asarray(returns)[: seeds * num].reshape(seeds, num)
+    found = jax.device_get(measure(*lanes, replicate(layout.mesh, network.params)))
+    found = jax.tree.map(lambda rows: rows[: seeds * num].reshape(seeds, num), found)
+    return found.return_, int(found.num_failed.sum())
 
 
 def run_adaptation(
@@ -247,7 +264,7 @@ def run_variants(
 
         return advance
 
-    measure = over_lanes(partial(mean_greedy_return, env, network.config, eval_episodes))
+    measure = over_lanes(partial(measure_prompt, env, network.config, eval_episodes))
     lane_tasks, keys, hyper = split(mesh, (lane_tasks, keys, hyper))
     params = replicate(mesh, network.params)
     state = start(keys, lane_tasks, hyper, params)
@@ -260,7 +277,7 @@ def run_variants(
     }
     measured = measure.lower(keys, lane_tasks, best, params).compile()
     logs: list[AdaptLog] = []
-    evaluations = []
+    evaluations: list[Measured] = []
     cpu = time.process_time()
     with tqdm(total=episodes * lanes, unit="episode", disable=None) as progress:
         for number, size in enumerate([0, *sizes]):
@@ -268,7 +285,7 @@ def run_variants(
                 state, log, best = searches[size](state, lane_tasks, hyper, params)
                 logs.append(jax.device_get(log))
             eval_keys = jax.vmap(partial(jax.random.fold_in, data=number))(keys)
-            evaluations.append(np.asarray(measured(eval_keys, lane_tasks, best, params)))
+            evaluations.append(jax.device_get(measured(eval_keys, lane_tasks, best, params)))
             progress.update(size * lanes)
     cpu = time.process_time() - cpu
 
@@ -276,7 +293,10 @@ def run_variants(
         return array[:lanes].reshape(len(variants), seeds, num, *array.shape[1:])
 
     log = jax.tree.map(lambda *leaves: by_variant(np.concatenate(leaves, axis=1)), *logs)
-    eval_returns = by_variant(np.stack(evaluations, axis=-1))
+    measurements = jax.tree.map(lambda *rows: by_variant(np.stack(rows, axis=-1)), *evaluations)
+    num_failed = [
+        int(log.failed[v].sum() + measurements.num_failed[v].sum()) for v in range(len(variants))
+    ]
     # The search, too, begins with one evaluation of (g^M).
     after = np.concatenate([[1], np.cumsum(sizes)])
     share = layout.num_lanes / len(variants)
@@ -285,8 +305,9 @@ def run_variants(
         Outcome(
             jax.tree.map(lambda leaf, v=v: leaf[v], log),
             after,
-            eval_returns[v],
+            measurements.return_[v],
             total,
+            num_failed[v],
             cpu / len(variants),
         )
         for v in range(len(variants))

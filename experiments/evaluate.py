@@ -39,17 +39,25 @@ class EvaluateConfig(Common):
     """Also write the rows to this file."""
 
 
-def evaluate_run(config: EvaluateConfig, folder: Path) -> dict[str, str | float]:
-    """The optimized prompts of one adaptation in the world with noise."""
+def noisy_world(config: EvaluateConfig, folder: Path) -> Noisy:
+    """The world of an adaptation, with noise."""
+    try:
+        env = make_env(load_results(folder).config["env"])
+        return Noisy(env, config.obs_noise, config.action_noise)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+
+
+def evaluate_run(config: EvaluateConfig, folder: Path, env: Noisy) -> dict[str, str | float]:
+    """The optimized prompts of one adaptation in its world with noise."""
     result = load_results(folder)
-    env = make_env(result.config["env"])
     path = result.config.get("policy")
     network = load_network(env, path and Path(path))
     prompts = Prompt(
         jnp.asarray(result.best_goals[:, :, -1]), jnp.asarray(result.best_masks[:, :, -1])
     )
-    returns = evaluate_prompts(
-        Noisy(env, config.obs_noise, config.action_noise),
+    returns, num_failed = evaluate_prompts(
+        env,
         network,
         load_tasks(folder / "tasks.npz", env),
         prompts,
@@ -66,6 +74,7 @@ def evaluate_run(config: EvaluateConfig, folder: Path) -> dict[str, str | float]
         "std_over_seeds": noisy.std,
         "without_noise": quiet.mean,
         "change": noisy.mean - quiet.mean,
+        "failed_episodes": num_failed,
     }
 
 
@@ -78,11 +87,14 @@ def main(config: EvaluateConfig) -> None:
         )
     if min(config.obs_noise, config.action_noise) < 0:
         raise UsageError("--obs-noise and --action-noise must not be negative")
+    if config.json and not config.json.parent.is_dir():
+        raise UsageError(f"no folder {config.json.parent} to write {config.json.name} to")
+    worlds = [noisy_world(config, folder) for folder in config.runs]
     head = ["env", "optimizer", "without noise", "with noise (mean ± std over seeds)", "change"]
     print(f"| {' | '.join(head)} |\n|{' --- |' * len(head)}")
     rows = []
-    for folder in config.runs:
-        row = evaluate_run(config, folder)
+    for folder, env in zip(config.runs, worlds, strict=True):
+        row = evaluate_run(config, folder, env)
         rows.append(row)
         print(
             f"| {row['env']} | {row['optimizer']} | {row['without_noise']:.3f} "

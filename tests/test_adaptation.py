@@ -147,10 +147,11 @@ def test_prompts_evaluated_again_have_the_same_returns(sweep):
     outcome = sweep[1]
     best = jax.tree.map(lambda leaf: leaf[:, :, -1], outcome.log.best)
     again = partial(evaluate_prompts, network=untrained(MAZE), tasks=sample_tasks(MAZE, 5, 3))
-    returns = again(MAZE, prompts=best, episodes=2)
+    returns, num_failed = again(MAZE, prompts=best, episodes=2)
+    assert num_failed == 0
     np.testing.assert_allclose(returns, outcome.eval_returns[:, :, -1], atol=1e-5)
     # Nothing but noise: every action is random, whatever the prompt.
-    blind = again(Noisy(MAZE, action_noise=1.0), prompts=best, episodes=40)
+    blind, _ = again(Noisy(MAZE, action_noise=1.0), prompts=best, episodes=40)
     assert blind.shape == returns.shape
     assert not np.allclose(blind, returns)
     np.testing.assert_allclose(blind[0], blind[1], atol=0.4)
