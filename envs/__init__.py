@@ -16,7 +16,8 @@ def _kitchen(backend: str = "auto", model: str = "reduced") -> Environment:
     from envs.kitchen import Kitchen, check_extra
 
     check_extra()
-    return Kitchen(name="kitchen", horizon=500, backend=backend, model=model)
+    name = "kitchen-stock" if model == "stock" else "kitchen"
+    return Kitchen(name=name, horizon=500, backend=backend, model=model)
 
 
 # The paper's sizes 15 and 30; walls lie on even cells, so a side is odd: 15 and 31.
@@ -25,9 +26,10 @@ ENVIRONMENTS: dict[str, Callable[[], Environment]] = {
     "maze30": lambda: MazeRunner(name="maze30", side=31, horizon=500),
     "gridworld": lambda: GridWorld(name="gridworld", horizon=90),
     "kitchen": _kitchen,
-    # The same world with the physics chosen by hand: policies, tasks and datasets are those of kitchen.
+    # The engine chosen by hand; policies, tasks and datasets are those of kitchen.
     "kitchen-mjx": lambda: _kitchen("mjx"),
     "kitchen-native": lambda: _kitchen("native"),
+    # The same tasks in the full scene: a world of its own.
     "kitchen-stock": lambda: _kitchen("native", "stock"),
 }
 

@@ -203,10 +203,8 @@ def open_run(config: PretrainConfig) -> Path:
     except ValueError:
         raise DataError(f"{saved} is not readable JSON") from None
     now = to_json(replace(config, resume=False, debug=False))
-    before = {**before, "debug": False}
-    changed = [
-        f"{name} {before.get(name)} -> {now[name]}" for name in now if now[name] != before.get(name)
-    ]
+    before = {**to_json(PretrainConfig()), **before, "debug": False}
+    changed = [f"{name} {before[name]} -> {now[name]}" for name in now if now[name] != before[name]]
     if changed:
         raise UsageError(f"{folder} was started with other settings: {'; '.join(changed)}")
     return folder
@@ -225,6 +223,7 @@ def main(config: PretrainConfig) -> None:
     if not config.resume:
         refuse_existing(config.folder, "continue it with --resume", "choose another with --out")
     env = make_env(config.env)
+    network_config(env.spec, config.head)  # complains about a head that does not fit
     dataset = prepare_dataset(config, env)
     network = configured_network(config, env, dataset)
     folder = open_run(config)

@@ -22,6 +22,7 @@ from experiments.runtime import Common, refuse_existing, run
 from experiments.tasks import benchmark_tasks, save_tasks
 from mgpo_jax.checkpoint import CONFIG, WEIGHTS, load_policy_files
 from mgpo_jax.errors import UsageError
+from mgpo_jax.pretrain import HIT
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +35,7 @@ class ReleaseConfig(Common):
     """Folder to write (default: pretrained/ENV)."""
 
 
+FOLLOWED = "eval/followed_return"
 CARD = """# Multi-goal Transformer for {env}
 
 | | |
@@ -42,9 +44,9 @@ CARD = """# Multi-goal Transformer for {env}
 | prompts | up to {max_prompt_length} goals, {order} |
 | data | {episodes:,} demonstrations of {demonstrator}, seed {data_seed} |
 | training | {steps:,} steps of {batch_size} trajectories, {optimizer}, {cpu_minutes:.0f} CPU-minutes |
-| validation loss | {val_loss:.4f} nats an action, accuracy {val_accuracy:.4f} |
+| validation loss | {val_loss:.4f} nats an action, {correct} {val_accuracy:.4f} |
 | greedy return of the prompt (g^M) | {initial:.3f} on {eval_tasks} tasks of the training's own |
-| greedy return of a demonstration's prompt | {followed:.3f} on the same tasks |
+| greedy return of a demonstration's prompt | {followed} |
 
 Made by
 
@@ -64,14 +66,8 @@ def main(config: ReleaseConfig) -> None:
         raise UsageError(f"{config.source} has no finished policy; let its training end first")
     network, params, made = load_policy_files(policy)
     env = make_env(made["env"])
-    folder = config.out or PRETRAINED / made["env"]
+    folder = config.out or PRETRAINED / env.spec.name
     refuse_existing(folder, "remove it", "choose another with --out")
-    folder.mkdir(parents=True)
-    for name in (WEIGHTS, CONFIG):
-        shutil.copy(policy / name, folder / name)
-    shutil.copy(config.source / "metrics.jsonl", folder)
-    training_curve(folder / "metrics.jsonl").savefig(folder / "training.png")
-    save_tasks(folder / "tasks.npz", benchmark_tasks(env))
     rows = [json.loads(row) for row in (config.source / "metrics.jsonl").read_text().splitlines()]
     settings, last = made["config"], rows[-1]
     steps_between = [
@@ -98,10 +94,17 @@ def main(config: ReleaseConfig) -> None:
         val_loss=last["val/loss"],
         val_accuracy=last["val/accuracy"],
         initial=last["eval/initial_return"],
-        followed=last["eval/followed_return"],
+        followed=f"{last[FOLLOWED]:.3f} on the same tasks" if FOLLOWED in last else "-",
+        correct="accuracy" if env.spec.discrete else f"share within {HIT} in all dimensions",
         eval_tasks=settings["eval_tasks"],
         command=" ".join(meta["command"]),
     )
+    folder.mkdir(parents=True)
+    for name in (WEIGHTS, CONFIG):
+        shutil.copy(policy / name, folder / name)
+    shutil.copy(config.source / "metrics.jsonl", folder)
+    training_curve(folder / "metrics.jsonl").savefig(folder / "training.png")
+    save_tasks(folder / "tasks.npz", benchmark_tasks(env))
     (folder / "README.md").write_text(text)
     print(f"released in {folder}", file=sys.stderr)
 

@@ -89,9 +89,9 @@ def run(
     argv = sys.argv[1:]
     debug = "--debug" in argv
     try:
+        configure()  # before a default asks jax for its devices
         values = {} if default is None else {"default": default(argv)}
         config = tyro.cli(config_class, args=argv, description=main.__doc__, **values)
-        configure()
         main(config)
     except KeyboardInterrupt:
         sys.exit(EXIT_INTERRUPTED)

@@ -342,3 +342,46 @@ def test_release_packs_a_run_with_its_card(command: Run, workspace: Path) -> Non
     assert (code, "packed exists already" in text) == (2, True)
     code, text = command("release nowhere")
     assert (code, "nowhere has no finished policy" in text) == (2, True)
+
+
+def test_a_continuous_world_from_data_to_release(
+    command: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Heads, standardized observations and noise, on single subtasks of a short kitchen."""
+    pytest.importorskip("mujoco")
+    from envs.experts import kitchen as experts
+    from envs.kitchen import Kitchen
+
+    real = experts.kitchen_demonstrators
+
+    def of_single_subtasks(env: Any) -> Any:
+        sample = lambda key, index: env.task(index % 5)  # noqa: E731
+        return {"expert": real(env)["expert"]._replace(sample_task=sample)}
+
+    monkeypatch.setattr(experts, "kitchen_demonstrators", of_single_subtasks)
+    monkeypatch.setitem(envs.ENVIRONMENTS, "kitchen", lambda: Kitchen("kitchen", horizon=120))
+    code, text = command(
+        "pretrain --env kitchen --preset smoke --episodes 24 --holdout 8 --embed-dim 8 "
+        "--num-layers 1 --steps 4 --batch-size 8 --part-size 4 --bucket 60 --eval-tasks 2 "
+        "--eval-every 2 --save-every 2 --out run"
+    )
+    assert code == 0, text
+    network, _, _ = load_policy_files(Path("run/policy"))
+    dataset, manifest = load_dataset(Path("data/kitchen/expert-24-seed0"))
+    assert network.head == "mixture"
+    np.testing.assert_allclose(network.obs_mean, dataset.obs.mean(axis=0), atol=1e-3)
+    assert manifest["failed_episodes"] == 0
+    code, text = command(
+        "adapt --env kitchen --policy run/policy --seeds 1 --episodes 4 --eval-every 2 "
+        "--no-figures --out result"
+    )
+    assert code == 0, text
+    summary = json.loads(Path("result/summary.json").read_text())
+    assert (summary["num_tasks"], summary["failed_episodes"]) == (25, 0)
+    code, text = command("evaluate result --obs-noise 0.05 --episodes 1 --json rows.json")
+    assert code == 0, text
+    (row,) = json.loads(Path("rows.json").read_text())["rows"]
+    assert row["change"] == pytest.approx(row["return"] - row["without_noise"])
+    assert row["failed_episodes"] == 0
+    assert command("release run --out packed") == (0, "released in packed\n")
+    assert "share within 0.1 in all dimensions" in Path("packed/README.md").read_text()
