@@ -13,7 +13,7 @@ from envs.noisy import Noisy
 from experiments.adaptation import NUM_EVAL_EPISODES, evaluate_prompts
 from experiments.configs import make_env, positive
 from experiments.policies import load_network
-from experiments.results import load_results
+from experiments.results import Results, load_results
 from experiments.runtime import Common, provenance, run, write_json
 from experiments.statistics import seed_spread
 from experiments.tasks import load_tasks
@@ -39,18 +39,18 @@ class EvaluateConfig(Common):
     """Also write the rows to this file."""
 
 
-def noisy_world(config: EvaluateConfig, folder: Path) -> Noisy:
+def noisy_world(config: EvaluateConfig, result: Results) -> Noisy:
     """The world of an adaptation, with noise."""
     try:
-        env = make_env(load_results(folder).config["env"])
-        return Noisy(env, config.obs_noise, config.action_noise)
+        return Noisy(make_env(result.config["env"]), config.obs_noise, config.action_noise)
     except ValueError as error:
         raise UsageError(str(error)) from None
 
 
-def evaluate_run(config: EvaluateConfig, folder: Path, env: Noisy) -> dict[str, str | float]:
+def evaluate_run(
+    config: EvaluateConfig, folder: Path, result: Results, env: Noisy
+) -> dict[str, str | float]:
     """The optimized prompts of one adaptation in its world with noise."""
-    result = load_results(folder)
     path = result.config.get("policy")
     network = load_network(env, path and Path(path))
     prompts = Prompt(
@@ -89,12 +89,13 @@ def main(config: EvaluateConfig) -> None:
         raise UsageError("--obs-noise and --action-noise must not be negative")
     if config.json and not config.json.parent.is_dir():
         raise UsageError(f"no folder {config.json.parent} to write {config.json.name} to")
-    worlds = [noisy_world(config, folder) for folder in config.runs]
+    results = [load_results(folder) for folder in config.runs]
+    worlds = [noisy_world(config, result) for result in results]
     head = ["env", "optimizer", "without noise", "with noise (mean ± std over seeds)", "change"]
     print(f"| {' | '.join(head)} |\n|{' --- |' * len(head)}")
     rows = []
-    for folder, env in zip(config.runs, worlds, strict=True):
-        row = evaluate_run(config, folder, env)
+    for folder, result, env in zip(config.runs, results, worlds, strict=True):
+        row = evaluate_run(config, folder, result, env)
         rows.append(row)
         print(
             f"| {row['env']} | {row['optimizer']} | {row['without_noise']:.3f} "
