@@ -26,6 +26,10 @@ class Distribution(Protocol):
 
     def mode(self) -> Array: ...
 
+    def explore(self, key: PRNGKeyArray) -> Array:
+        """One of the things that the policy may do; unlike a sample, without noise on top."""
+        ...
+
 
 class Categorical(NamedTuple):
     """Distribution over the actions 0..A-1."""
@@ -42,6 +46,9 @@ class Categorical(NamedTuple):
 
     def mode(self) -> Int[Array, "*batch"]:
         return jnp.argmax(self.logits, axis=-1)
+
+    def explore(self, key: PRNGKeyArray) -> Int[Array, "*batch"]:
+        return self.sample(key)
 
 
 class Gaussian(NamedTuple):
@@ -64,6 +71,9 @@ class Gaussian(NamedTuple):
     def mode(self) -> Float[Array, "*batch A"]:
         return jnp.clip(self.mean, -1.0, 1.0)
 
+    def explore(self, key: PRNGKeyArray) -> Float[Array, "*batch A"]:
+        return self.sample(key)
+
 
 class Mixture(NamedTuple):
     """Mixture of M diagonal Gaussians; its mode is taken to be the mean of the likeliest component."""
@@ -84,6 +94,10 @@ class Mixture(NamedTuple):
 
     def mode(self) -> Float[Array, "*batch A"]:
         return self._component(jnp.argmax(self.logits, axis=-1)).mode()
+
+    def explore(self, key: PRNGKeyArray) -> Float[Array, "*batch A"]:
+        """The mean of a random component: their spread is the demonstrator's noise, not its intention."""
+        return self._component(jax.random.categorical(key, self.logits)).mode()
 
     def _component(self, which: Int[Array, "*batch"]) -> Gaussian:
         index = which[..., None, None]
@@ -120,6 +134,9 @@ class Binned(NamedTuple):
         near = jnp.abs(jnp.arange(num_values) - likeliest) <= 1
         weights = jax.nn.softmax(jnp.where(near, self.logits, -jnp.inf))
         return weights @ jnp.linspace(-1.0, 1.0, num_values)
+
+    def explore(self, key: PRNGKeyArray) -> Float[Array, "*batch A"]:
+        return self.sample(key)
 
 
 class Head(NamedTuple):

@@ -31,7 +31,7 @@ def prompted(policy: Policy, query: Query) -> Agent:
     """The agent that follows ``policy`` under one prompt, greedily or by sampling."""
 
     def act(key: PRNGKeyArray, distribution: Any) -> Array:
-        return jnp.where(query.greedy, distribution.mode(), distribution.sample(key))
+        return jnp.where(query.greedy, distribution.mode(), distribution.explore(key))
 
     def begin(key: PRNGKeyArray, task: Task, state: State, timestep: TimeStep) -> tuple:
         distribution, carry = policy.prefill(query.prompt, timestep.obs)

@@ -176,3 +176,16 @@ def test_gaussian_heads_bound_their_spread():
     fixed = HEADS["fixed_gaussian"].make(jnp.array([0.7, -40.0]))
     np.testing.assert_allclose(fixed.mean, np.tanh([0.7, -40.0]), rtol=1e-5)
     np.testing.assert_array_equal(fixed.log_std, [-1.0, -1.0])
+
+
+def test_a_mixture_explores_by_its_components():
+    """Means of the components, as often as they are likely; other heads sample."""
+    mixture = a_mixture()
+    keys = jax.random.split(jax.random.key(0), 4000)
+    actions = np.asarray(jax.vmap(mixture.explore)(keys))
+    which = np.abs(actions[:, None] - np.clip(MEANS, -1, 1)).max(axis=-1)
+    assert (which.min(axis=1) < 1e-6).all()
+    shares = np.bincount(which.argmin(axis=1), minlength=len(WEIGHTS)) / len(keys)
+    np.testing.assert_allclose(shares, WEIGHTS, atol=0.03)
+    gaussian = Gaussian(jnp.asarray(MEAN), jnp.asarray(LOG_STD))
+    np.testing.assert_array_equal(gaussian.explore(keys[0]), gaussian.sample(keys[0]))
