@@ -72,7 +72,7 @@ class AdaptConfig(Common):
     episode, else 10)."""
     keep_rewarded: bool = True
     """UCB, BPE, explore: in worlds that reward a sequence part by part, new prompts keep the goals of the
-    best trajectory that were rewarded [False]."""
+    best trajectory that were rewarded and shuffle those after them [False]."""
     out: Path | None = None
     """Result folder (default: runs/adapt/ENV/BANDIT-seedSEED)."""
     figures: bool = True

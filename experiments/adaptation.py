@@ -217,8 +217,8 @@ def run_variants(
       eval_every: episodes between evaluations of the best prompt.
       eval_episodes: greedy episodes that an evaluation averages (default: 1 in deterministic worlds,
         else ``NUM_EVAL_EPISODES``).
-      keep_rewarded: whether bandits keep the rewarded goals of the best trajectory where
-        ``EnvSpec.reward_confirms_goals``.
+      keep_rewarded: whether bandits keep the rewarded goals of the best trajectory and shuffle those
+        after them, where ``EnvSpec.reward_confirms_goals``.
     """
     num = num_tasks(tasks)
     eval_episodes = eval_episodes or (1 if env.spec.deterministic else NUM_EVAL_EPISODES)

@@ -55,10 +55,11 @@ def sample_prompt(
       num_slots: P, the number of slots of the returned prompt (static).
       max_goals: K <= P, the largest number of goals with the final one (traced; default P).
       kept: steps whose goals are in every prompt, as far as there is room; the number of goals is
-        then uniform between those kept and those there are (not in the paper; default none).
+        then uniform between those kept and those there are, and goals reached after the last kept
+        step come in any order (not in the paper; default none).
 
     Returns:
-      A right-aligned prompt; goals keep the order in which the trajectory reached them.
+      A right-aligned prompt; goals keep the order in which the trajectory reached them, but for ``kept``.
     """
     key_count, key_index = jax.random.split(key)
     num_steps = trajectory.goal_reached.shape[0]
@@ -80,13 +81,18 @@ def sample_prompt(
     num_drawn = min(num_slots - 1, num_steps)
     rank = jnp.arange(num_drawn)
     scores = jnp.where(eligible, jax.random.uniform(key_index, (num_steps,)), -1.0)
+    place = time
     if kept is not None:
         scores = jnp.where(kept, 2.0, scores)
+        shuffled = num_steps + jax.random.permutation(jax.random.fold_in(key_index, 0), num_steps)
+        place = jnp.where(time > jnp.max(jnp.where(kept, time, -1)), shuffled, time)
     _, drawn = jax.lax.top_k(scores, num_drawn)
-    drawn = jnp.sort(jnp.where(rank < count, drawn, -1))  # unused slots first, then in order
+    used = rank < count
+    order = jnp.argsort(jnp.where(used, place[drawn], -1))  # unused slots first
+    drawn, used = drawn[order], used[order]
 
     empty = num_slots - 1 - num_drawn
-    mask = jnp.concatenate([jnp.zeros(empty, bool), drawn >= 0, jnp.ones(1, bool)])
+    mask = jnp.concatenate([jnp.zeros(empty, bool), used, jnp.ones(1, bool)])
     goals = jnp.concatenate(
         [jnp.zeros((empty, final_goal.shape[0])), trajectory.goals[drawn], final_goal[None]]
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import combinations
+from itertools import combinations, permutations
 
 import jax
 import jax.numpy as jnp
@@ -181,15 +181,28 @@ def test_kept_goals_are_in_every_prompt(kept, max_goals, always, sizes):
         0, trajectory, max_goals, jnp.isin(jnp.arange(NUM_STEPS), jnp.array(kept, int))
     )
     steps = np.where(np.asarray(drawn.mask), np.asarray(drawn.goals)[..., 0] - 1, np.nan)
+    kept_here = [step for step in kept if 0 < step < 8]
     assert set(np.asarray(drawn.mask).sum(axis=1).tolist()) == sizes
     for row in steps:
         named = row[np.isfinite(row)][:-1]
         assert set(always) <= set(named.tolist())
-        assert (np.diff(named) > 0).all()
+        settled = named[named <= max(kept_here, default=-1)]
+        np.testing.assert_array_equal(named[: len(settled)], np.sort(settled))
     # The other goals are as likely as each other.
     others = [step for step in range(1, 8) if step not in always]
     counts = [(steps == step).sum() for step in others]
     assert max(counts) < 1.5 * max(min(counts), 1)
+
+
+def test_goals_after_the_last_kept_one_come_in_any_order():
+    trajectory = make_trajectory([True] * NUM_STEPS, length=6)
+    drawn = draw_kept(3, trajectory, NUM_SLOTS, jnp.arange(NUM_STEPS) == 2)
+    rows = np.where(np.asarray(drawn.mask), np.asarray(drawn.goals)[..., 0] - 1, np.nan)[:, :-1]
+    rows = [tuple(row[np.isfinite(row)].astype(int)) for row in rows]
+    assert {row[row.index(2) + 1 :] for row in rows} == {
+        after for size in range(NUM_SLOTS - 1) for after in permutations((3, 4, 5), size)
+    }
+    assert {row[: row.index(2)] for row in rows} == {(), (0,), (1,), (0, 1)}
 
 
 def test_a_trajectory_ends_where_it_reaches_the_goal():

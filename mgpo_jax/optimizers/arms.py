@@ -10,8 +10,8 @@ samples actions in a world of chance (as the text has it): there one greedy epis
 and sampling finds orders of goals that greedy actions never take.
 
 Where a reward confirms the goals that led to it (``SearchSpace.keep_rewarded``; not in the paper), new
-prompts keep the rewarded goals of the best trajectory and vary the rest: what earned k/n of a
-sequence is its first k parts.
+prompts keep the rewarded goals of the best trajectory and vary what came after them, in content and in
+order: what earned k/n of a sequence is its first k parts, and the rest was evidently not right as it was.
 
 As in the authors' code the chosen prompt acts by sampling, and among trajectories of equal return the
 newest counts as the best. Unlike it, an arm is inserted when it beats the best *mean* (as the paper has

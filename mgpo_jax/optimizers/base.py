@@ -48,7 +48,8 @@ class SearchSpace:
     deterministic: bool = True
     """Whether a prompt's greedy episode always has the same return."""
     keep_rewarded: bool = False
-    """Whether prompts drawn from a trajectory keep the goals that were rewarded (bandits)."""
+    """Whether prompts drawn from a trajectory keep the goals that were rewarded, and shuffle those that
+    were reached afterwards (bandits)."""
 
     @property
     def longest(self) -> int | Int[Array, ""] | Any:
