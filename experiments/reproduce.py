@@ -28,12 +28,14 @@ from experiments.results import load_results
 from experiments.runtime import Common, run
 from experiments.table import read_summary
 from experiments.tasks import benchmark_tasks
+from mgpo_jax.distributions import HEADS
 from mgpo_jax.errors import UsageError, nearest
 from mgpo_jax.optimizers import ucb
 
 EPISODES = 100  # of an adaptation
-# Gradient steps of each training of a table.
-STEPS = {"maze15": 2_000, "maze30": 1_000}
+# Gradient steps of each training of a table, and its trajectories.
+STEPS = {"maze15": 2_000, "maze30": 1_000, "kitchen": 1_000}
+TRAJECTORIES = {"maze15": 10_000, "maze30": 10_000, "kitchen": 9_000}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,15 +43,16 @@ class ReproduceConfig(Common):
     """Settings of ``experiments.reproduce``."""
 
     what: tyro.conf.Positional[str]
-    """table4 (prompt length and c of UCB), table5 (datasets) or figure8 (longer prompts)."""
+    """table4 (prompt length and c of UCB), table5 (datasets), figure8 (longer prompts) or heads
+    (distributions of continuous actions)."""
     env: str = "maze15"
-    """The world: maze15 or maze30."""
+    """The world: maze15, maze30 or kitchen."""
     only: tuple[str, ...] = ()
-    """Names of the datasets (table5), or prompt lengths (figure8), to train on (default: all)."""
+    """Names of the datasets (table5), prompt lengths (figure8) or heads to train (default: all)."""
     steps: int | None = None
-    """Gradient steps of each training (default: 2,000 for maze15, 1,000 for maze30)."""
-    episodes: int = 10_000
-    """Trajectories of each dataset [10,000]."""
+    """Gradient steps of each training (default: 2,000 for maze15, 1,000 for the others)."""
+    episodes: int | None = None
+    """Trajectories of each dataset (default: as in the paper) [10,000 in mazes, 9,000 in kitchen]."""
     seeds: int = 3
     """Independent adaptations to each test task [3]."""
     out: Path = RUNS / "reproduce"
@@ -63,6 +66,10 @@ class ReproduceConfig(Common):
     def num_steps(self) -> int:
         return self.steps or STEPS[self.env]
 
+    @property
+    def num_trajectories(self) -> int:
+        return self.episodes or TRAJECTORIES[self.env]
+
 
 class Line(NamedTuple):
     """One row of a table: its results, and what the paper has for it."""
@@ -72,7 +79,7 @@ class Line(NamedTuple):
     paper: str
 
 
-# Paper, Tables 4 and 5: MGPO-UCB, mean return over 50 test tasks of its own.
+# Paper, Tables 4 and 5: MGPO-UCB, mean return over test tasks of its own.
 PAPER = {
     "maze15": {
         "K = 1": "-2.63 ± 0.00",
@@ -100,27 +107,41 @@ PAPER = {
         "astar2": "-8.66 ± 0.35",
         "astar4": "-14.21 ± 0.19",
     },
+    "kitchen": {
+        "K = 1": "0.09 ± 0.00",
+        "K = 2": "0.28 ± 0.00",
+        "K = 3": "0.48 ± 0.02",
+        "K = 5": "0.63 ± 0.02",
+        "c = 0": "0.63 ± 0.05",
+        "c = 1": "0.63 ± 0.02",
+        "c = 10": "0.66 ± 0.02",
+    },
 }
 
 
-def trained(config: ReproduceConfig, dataset: str, max_prompt_length: int | None = None) -> Path:
-    """The policy of one training, which is run or continued if it is not finished."""
+def trained(
+    config: ReproduceConfig, label: str, demonstrator: str | None = None, **changes: Any
+) -> Path:
+    """The policy of one training, which is run or continued if it is not finished.
+
+    Args:
+      config: settings of the command.
+      label: what the run's folder is named after, beside its size.
+      demonstrator: whose dataset (default: that of the world's recipe).
+      **changes: what else differs from the world's ``PretrainConfig``.
+    """
     fast = pretrain_preset(config.env, "fast")
-    max_prompt_length = max_prompt_length or fast.max_prompt_length
-    name = f"{dataset}-k{max_prompt_length}-{config.num_steps}steps-{config.episodes}episodes"
-    folder = config.folder / "policies" / name
+    settings = replace(
+        fast,
+        data=DataConfig(demonstrator or fast.data.demonstrator, config.num_trajectories),
+        train=replace(fast.train, steps=config.num_steps),
+        **changes,
+    )
+    size = f"{config.num_steps}steps-{config.num_trajectories}episodes"
+    folder = config.folder / "policies" / f"{label}-k{settings.max_prompt_length}-{size}"
     if not (folder / "policy").is_dir():
         print(f"training {folder}", file=sys.stderr)
-        pretrain(
-            replace(
-                fast,
-                data=DataConfig(demonstrator=dataset, episodes=config.episodes),
-                train=replace(fast.train, steps=config.num_steps),
-                max_prompt_length=max_prompt_length,
-                out=folder,
-                resume=folder.exists(),
-            )
-        )
+        pretrain(replace(settings, out=folder, resume=folder.exists()))
     return folder / "policy"
 
 
@@ -184,7 +205,7 @@ def table5(config: ReproduceConfig) -> list[Line]:
     """One policy for each dataset (Table 5)."""
     lines = []
     for dataset in chosen(config, ("random", "astar1", "astar2", "astar4")):
-        policy = trained(config, dataset)
+        policy = trained(config, dataset, dataset)
         results = config.folder / "table5" / f"{policy.parent.name}-{config.seeds}seeds"
         adapted(config, policy, {results: {}})
         lines.append(Line(dataset, results, PAPER[config.env][dataset]))
@@ -195,17 +216,37 @@ def figure8(config: ReproduceConfig) -> list[Line]:
     """One policy for each longest prompt K (Figure 8)."""
     lines = []
     for length in chosen(config, ("5", "10", "20", "40")):
-        policy = trained(config, "astar4", int(length))
+        policy = trained(config, "astar4", "astar4", max_prompt_length=int(length))
         results = config.folder / "figure8" / f"{policy.parent.name}-{config.seeds}seeds"
         adapted(config, policy, {results: {}})
         lines.append(Line(f"K = {length}", results, ""))
     return lines
 
 
-ABLATIONS: dict[str, Callable[[ReproduceConfig], list[Line]]] = {
-    "table4": table4,
-    "table5": table5,
-    "figure8": figure8,
+def heads(config: ReproduceConfig) -> list[Line]:
+    """One policy for each distribution of continuous actions; the authors' code has the fixed Gaussian."""
+    lines = []
+    for head in chosen(config, [name for name in HEADS if name != "categorical"]):
+        policy = trained(config, head, head=head)
+        results = config.folder / "heads" / f"{policy.parent.name}-{config.seeds}seeds"
+        adapted(config, policy, {results: {}})
+        lines.append(Line(head, results, ""))
+    return lines
+
+
+class Ablation(NamedTuple):
+    """A table that the command makes, and the worlds it is of."""
+
+    make: Callable[[ReproduceConfig], list[Line]]
+    worlds: tuple[str, ...]
+
+
+MAZES = ("maze15", "maze30")
+ABLATIONS = {
+    "table4": Ablation(table4, (*MAZES, "kitchen")),
+    "table5": Ablation(table5, MAZES),
+    "figure8": Ablation(figure8, MAZES),
+    "heads": Ablation(heads, ("kitchen",)),
 }
 
 
@@ -242,13 +283,15 @@ def main(config: ReproduceConfig) -> None:
     positive(config, "steps", "episodes", "seeds")
     if config.what not in ABLATIONS:
         raise nearest(config.what, ABLATIONS, "ablation")
-    if config.env not in PAPER:
-        raise UsageError(f"the paper has no {config.what} for {config.env}; it has {list(PAPER)}")
-    lines = ABLATIONS[config.what](config)
+    ablation = ABLATIONS[config.what]
+    if config.env not in ablation.worlds:
+        worlds = " or ".join(ablation.worlds)
+        raise UsageError(f"there is no {config.what} for {config.env}; choose --env {worlds}")
+    lines = ablation.make(config)
     budget = (
         ""
         if config.what == "table4"
-        else (f", {config.num_steps:,} gradient steps on {config.episodes:,} trajectories each")
+        else f", {config.num_steps:,} gradient steps on {config.num_trajectories:,} trajectories each"
     )
     text = f"{config.env}, UCB, {config.seeds} seeds{budget}\n\n{markdown(lines)}\n"
     print(text)

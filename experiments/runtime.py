@@ -21,6 +21,7 @@ import subprocess
 import sys
 import traceback
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -147,9 +148,13 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def versions() -> dict[str, str]:
-    """Versions of what a result depends on."""
-    names = ("mgpo-jax", "jax", "jaxlib", "flax", "optax", "evosax", "numpy")
-    found = {name: metadata.version(name) for name in names}
+    """Versions of what a result depends on, as far as it is installed."""
+    required = ("mgpo-jax", "jax", "jaxlib", "flax", "optax", "evosax", "numpy")
+    extras = ("mujoco", "mujoco-mjx", "gymnasium-robotics")
+    found = {name: metadata.version(name) for name in required}
+    for name in extras:
+        with suppress(metadata.PackageNotFoundError):
+            found[name] = metadata.version(name)
     return {"python": platform.python_version(), **found}
 
 

@@ -70,16 +70,32 @@ def test_a_stopped_training_goes_on(tiny: Path, monkeypatch: pytest.MonkeyPatch)
     asked: list[PretrainConfig] = []
     monkeypatch.setattr(reproduce, "pretrain", asked.append)
     config = ReproduceConfig(what="figure8", steps=2)
-    policy = reproduce.trained(config, "astar4", 10)
+    policy = reproduce.trained(config, "astar4", "astar4", max_prompt_length=10)
     policy.parent.mkdir(parents=True)
-    reproduce.trained(config, "astar4", 10)
+    reproduce.trained(config, "astar4", "astar4", max_prompt_length=10)
     assert [one.resume for one in asked] == [False, True]
     for one in asked:
         assert (one.out, one.max_prompt_length) == (policy.parent, 10)
         assert (one.data.demonstrator, one.train.steps) == ("astar4", 2)
     policy.mkdir()
-    reproduce.trained(config, "astar4", 10)
+    reproduce.trained(config, "astar4", "astar4", max_prompt_length=10)
     assert len(asked) == 2
+
+
+def test_heads_differ_in_nothing_else(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[PretrainConfig] = []
+    adapted: list[Path] = []
+    monkeypatch.setattr(reproduce, "pretrain", asked.append)
+    monkeypatch.setattr(
+        reproduce, "adapted", lambda config, policy, folders: adapted.extend(folders)
+    )
+    lines = reproduce.heads(ReproduceConfig(what="heads", env="kitchen", steps=2))
+    assert [line.label for line in lines] == ["gaussian", "fixed_gaussian", "mixture", "binned"]
+    assert [line.results for line in lines] == adapted
+    assert [one.head for one in asked] == [line.label for line in lines]
+    same = {replace(one, head=None, out=None) for one in asked}
+    assert len(same) == 1
+    assert same.pop().data.episodes == 9_000
 
 
 @pytest.mark.parametrize(
@@ -87,6 +103,7 @@ def test_a_stopped_training_goes_on(tiny: Path, monkeypatch: pytest.MonkeyPatch)
     [
         (ReproduceConfig(what="tabel5"), "did you mean 'table5'"),
         (ReproduceConfig(what="table5", env="gridworld"), "no table5 for gridworld"),
+        (ReproduceConfig(what="heads"), "no heads for maze15; choose --env kitchen"),
         (ReproduceConfig(what="table5", only=("astar3",)), "did you mean 'astar"),
         (ReproduceConfig(what="figure8", only=("41",)), "row of figure8"),
         (ReproduceConfig(what="table4", steps=0), "--steps must be at least 1"),
