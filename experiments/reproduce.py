@@ -201,37 +201,53 @@ def table4(config: ReproduceConfig) -> list[Line]:
     return [Line(label, path, paper[label]) for label, path in lines]
 
 
+def chosen(config: ReproduceConfig, names: Sequence[str]) -> Sequence[str]:
+    """Those of ``names`` that ``--only`` leaves."""
+    for name in config.only:
+        if name not in names:
+            raise nearest(name, names, f"row of {config.what}")
+    return config.only or names
+
+
+def compared(
+    config: ReproduceConfig,
+    names: Sequence[str],
+    train: Callable[[str], Path],
+    label: str = "{}",
+    paper: Mapping[str, str] | None = None,
+) -> list[Line]:
+    """One policy, and one adaptation with it, for each of the names that ``--only`` leaves."""
+    lines = []
+    for name in chosen(config, names):
+        policy = train(name)
+        results = config.folder / config.what / f"{policy.parent.name}-{config.seeds}seeds"
+        adapted(config, policy, {results: {}})
+        lines.append(Line(label.format(name), results, (paper or {}).get(name, "")))
+    return lines
+
+
 def table5(config: ReproduceConfig) -> list[Line]:
     """One policy for each dataset (Table 5)."""
-    lines = []
-    for dataset in chosen(config, ("random", "astar1", "astar2", "astar4")):
-        policy = trained(config, dataset, dataset)
-        results = config.folder / "table5" / f"{policy.parent.name}-{config.seeds}seeds"
-        adapted(config, policy, {results: {}})
-        lines.append(Line(dataset, results, PAPER[config.env][dataset]))
-    return lines
+    datasets = ("random", "astar1", "astar2", "astar4")
+    return compared(
+        config, datasets, lambda name: trained(config, name, name), paper=PAPER[config.env]
+    )
 
 
 def figure8(config: ReproduceConfig) -> list[Line]:
     """One policy for each longest prompt K (Figure 8)."""
-    lines = []
-    for length in chosen(config, ("5", "10", "20", "40")):
-        policy = trained(config, "astar4", "astar4", max_prompt_length=int(length))
-        results = config.folder / "figure8" / f"{policy.parent.name}-{config.seeds}seeds"
-        adapted(config, policy, {results: {}})
-        lines.append(Line(f"K = {length}", results, ""))
-    return lines
+    return compared(
+        config,
+        ("5", "10", "20", "40"),
+        lambda length: trained(config, "astar4", "astar4", max_prompt_length=int(length)),
+        "K = {}",
+    )
 
 
 def heads(config: ReproduceConfig) -> list[Line]:
     """One policy for each distribution of continuous actions; the authors' code has the fixed Gaussian."""
-    lines = []
-    for head in chosen(config, [name for name in HEADS if name != "categorical"]):
-        policy = trained(config, head, head=head)
-        results = config.folder / "heads" / f"{policy.parent.name}-{config.seeds}seeds"
-        adapted(config, policy, {results: {}})
-        lines.append(Line(head, results, ""))
-    return lines
+    names = [name for name in HEADS if name != "categorical"]
+    return compared(config, names, lambda head: trained(config, head, head=head))
 
 
 class Ablation(NamedTuple):
@@ -248,14 +264,6 @@ ABLATIONS = {
     "figure8": Ablation(figure8, MAZES),
     "heads": Ablation(heads, ("kitchen",)),
 }
-
-
-def chosen(config: ReproduceConfig, names: Sequence[str]) -> Sequence[str]:
-    """Those of ``names`` that ``--only`` leaves."""
-    for name in config.only:
-        if name not in names:
-            raise nearest(name, names, f"row of {config.what}")
-    return config.only or names
 
 
 def markdown(lines: Sequence[Line]) -> str:
