@@ -43,14 +43,20 @@ def test_prompts_in_words(goals, text):
 
 
 def test_a_panel_names_what_was_completed_until_the_end():
-    num, length = 6, 4
+    num, length = 80, 60
     goals = np.zeros((num, 5), np.float32)
-    goals[[1, 3, 5]] = MICROWAVE, LIGHT, HINGE
+    goals[[1, 30, 70]] = MICROWAVE, LIGHT, HINGE
     reached = goals.any(axis=1)
     obs = np.arange(num * 59, dtype=np.float32).reshape(num, 59)
     trajectory = Trajectory(obs, np.zeros((num, 9)), goals, reached, goals, np.array(length))
-    panel = kitchen.panel("An episode", Episode(trajectory, np.zeros(num), np.array(0.5)))
-    assert panel.completed == [(1, "microwave"), (3, "light")]
+    episode = Episode(trajectory, np.zeros(num), np.array(0.5))
+    panel = kitchen.panel("A prompt", prompt_of(HINGE), episode)
+    assert panel.title == "A prompt, return 0.50\nhinge"
+    assert panel.completed == [(1, "microwave"), (30, "light")]
+    np.testing.assert_array_equal(panel.obs, obs[: 30 + kitchen.REST])
+    none = trajectory._replace(goal_reached=np.zeros(num, bool))
+    panel = kitchen.panel("A prompt", prompt_of(HINGE), episode._replace(trajectory=none))
+    assert panel.completed == []
     np.testing.assert_array_equal(panel.obs, obs[:length])
 
 
@@ -78,14 +84,15 @@ def result():
 def test_initial_and_optimized_prompt_side_by_side(result, monkeypatch, tmp_path):
     pytest.importorskip("mujoco")
     drawn = {}
-    monkeypatch.setattr(kitchen, "kitchen_gif", lambda path, panels: drawn.update({path: panels}))
+    monkeypatch.setattr(kitchen, "kitchen_gif", lambda *args: drawn.update({args[0]: args[1:]}))
     env = envs.make("kitchen")
     kitchen.before_and_after(env, fake_policy(), result, 0, 0, tmp_path / "video.gif")
-    ((path, panels),) = drawn.items()
+    ((path, (title, panels)),) = drawn.items()
     assert path == tmp_path / "video.gif"
+    assert title == "Task, in an order that is not told: light, microwave"
     assert [panel.title for panel in panels] == [
-        "Initial prompt\n{light, microwave}",
-        "Optimized prompt\nlight > {light, microwave}",
+        "Initial prompt, return 0.00\n{light, microwave}",
+        "Optimized prompt, return 0.00\nlight > {light, microwave}",
     ]
     for panel in panels:
         assert isinstance(panel, Panel)
@@ -96,7 +103,7 @@ def test_initial_and_optimized_prompt_side_by_side(result, monkeypatch, tmp_path
 def test_no_opengl_is_a_sentence(result, monkeypatch, tmp_path):
     pytest.importorskip("mujoco")
 
-    def refuse(path, panels):
+    def refuse(*args):
         raise RuntimeError("no OpenGL to draw the kitchen with: install EGL or OSMesa")
 
     monkeypatch.setattr(kitchen, "kitchen_gif", refuse)

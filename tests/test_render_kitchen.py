@@ -24,7 +24,7 @@ obs = np.zeros((3, 59))
 obs[:, POSITIONS] = INITIAL_POSITIONS
 obs[2, 31] = -1.5  # microwave
 still = Panel("Nothing", obs[:1], [])
-kitchen_gif(sys.argv[1], [Panel("Microwave", obs, [(2, "microwave")]), still])
+kitchen_gif(sys.argv[1], "A task", [Panel("Microwave", obs, [(2, "microwave")]), still])
 """
 
 
@@ -51,7 +51,7 @@ def test_frames_show_what_moved(tmp_path):
         pytest.skip(f"neither EGL nor OSMesa here: {tries[-1].stderr.splitlines()[-1]}")
     frames = iio.imread(path).astype(int)
     changed = np.abs(frames[-1] - frames[0]).max(axis=-1) > 50
-    picture = changed[40:240]  # without the text
+    picture = changed[64:276]  # without the text
     left, right = np.split(picture, 2, axis=1)
     assert 0.001 < left.mean() < 0.2
     assert not right.any()  # the episode that has ended stands still

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,8 @@ from envs.kitchen.world import POSITIONS
 from envs.render.palette import INK, PAPER
 from envs.render.video import write_gif
 
-DPI, ABOVE, BELOW = 100, 34, 18  # pixels an inch; pixels of text above and below a picture
+DPI, ABOVE, BELOW = 100, 62, 18  # pixels an inch; pixels of text above and below a picture
+LINE = 52  # letters across a picture
 FRAMES = 75  # of a GIF
 GAP = 0.01  # between pictures, as a share of the width
 CAMERA = {"distance": 2.2, "azimuth": 70.0, "elevation": -35.0, "lookat": (-0.2, 0.5, 2.0)}
@@ -69,19 +71,23 @@ class Panel(NamedTuple):
     """Steps after which something was completed, and what."""
 
 
-def kitchen_gif(path: Path, panels: Sequence[Panel], height: int = 216, width: int = 288) -> None:
+def kitchen_gif(
+    path: Path, title: str, panels: Sequence[Panel], height: int = 216, width: int = 288
+) -> None:
     """Episodes side by side, at up to ``FRAMES`` of their times; those that end earlier stand still."""
     num_steps = max(len(panel.obs) for panel in panels)
     times = np.linspace(0, num_steps - 1, min(num_steps, FRAMES)).round().astype(int)
     whole = ABOVE + height + BELOW
     size = len(panels) * width / DPI, whole / DPI
     figure = Figure(figsize=size, dpi=DPI, facecolor=PAPER)
+    figure.text(0.5, 1 - 5 / whole, title, color=INK, fontsize=8.5, ha="center", va="top")
     drawn = []
     for number, panel in enumerate(panels):
         place = (number / len(panels), BELOW / whole, 1 / len(panels) - GAP, height / whole)
         axes = figure.add_axes(place)
         axes.set_axis_off()
-        axes.set_title(panel.title, color=INK, fontsize=7.5, pad=2)
+        lines = [fill(line, LINE) for line in panel.title.splitlines()]
+        axes.set_title("\n".join(lines), color=INK, fontsize=7.5, pad=2)
         below = axes.text(0.5, -0.02, "", color=INK, fontsize=7.5, transform=axes.transAxes)
         below.set(ha="center", va="top")
         frames = kitchen_frames(panel.obs[np.minimum(times, len(panel.obs) - 1)], height, width)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.kitchen import Kitchen, KitchenTask
+from envs.kitchen import NONE, Kitchen, KitchenTask
 from envs.render import Panel, kitchen_gif
 from experiments.figures.base import LoadPolicy, Pictures, Save, file_names, goals_of
 from experiments.results import Results
@@ -22,6 +22,7 @@ from mgpo_jax.prompts import single_goal
 from mgpo_jax.types import Episode, Prompt
 
 NAMES = ("burner", "light", "slide", "hinge", "microwave")  # of the subtasks
+REST = 25  # steps that are shown after the last completed subtask
 
 
 def kitchen_pictures(env: Kitchen) -> Pictures:
@@ -52,21 +53,22 @@ def before_and_after(
         "Optimized prompt": result.best_prompt(seed, index),
     }
     episode = jit_with(env)(lambda prompt: evaluate(jax.random.key(0), env, policy, task, prompt))
-    panels = [
-        panel(f"{name}\n{words(prompt)}", episode(prompt)) for name, prompt in prompts.items()
-    ]
+    panels = [panel(name, prompt, episode(prompt)) for name, prompt in prompts.items()]
+    order = [NAMES[subtask] for subtask in result.tasks["order"][index] if subtask != NONE]
     try:
-        kitchen_gif(path, panels)
+        kitchen_gif(path, f"Task, in an order that is not told: {', '.join(order)}", panels)
     except RuntimeError as error:
         raise UsageError(str(error)) from None
 
 
-def panel(title: str, episode: Episode) -> Panel:
-    """An episode as what it looked like and what was completed when."""
+def panel(name: str, prompt: Prompt, episode: Episode) -> Panel:
+    """An episode as what it looked like, until soon after the last subtask was completed."""
     trajectory = jax.tree.map(np.asarray, episode.trajectory)
     times = np.flatnonzero(trajectory.goal_reached[: trajectory.length])
     completed = [(int(time), NAMES[trajectory.goals[time].argmax()]) for time in times]
-    return Panel(title, trajectory.obs[: trajectory.length], completed)
+    end = min(trajectory.length, times[-1] + REST) if completed else trajectory.length
+    title = f"{name}, return {float(episode.return_):.2f}\n{words(prompt)}"
+    return Panel(title, trajectory.obs[:end], completed)
 
 
 def words(prompt: Prompt) -> str:
