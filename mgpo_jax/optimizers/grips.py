@@ -70,7 +70,9 @@ class GripsState(NamedTuple):
 def grips(space: SearchSpace, num_edits: int = 5) -> PromptOptimizer:
     """GRIPS with ``num_edits`` edited prompts an iteration, each evaluated greedily once.
 
-    The first episode evaluates (g^M); Algorithm 2 leaves its return at -inf.
+    The first episode evaluates (g^M); Algorithm 2 leaves its return at -inf. An edit of equal return is
+    accepted, unlike in Algorithm 2: where rewards are sparse, none of the prompts one edit away from (g^M)
+    may be better, and the search would never leave it.
     """
 
     def init(key: PRNGKeyArray, task_goal: Float[Array, "G"], blank: Trajectory) -> GripsState:
@@ -91,7 +93,7 @@ def grips(space: SearchSpace, num_edits: int = 5) -> PromptOptimizer:
         leader = choose(leads, query.prompt, state.leader)
         leader_return = jnp.maximum(episode.return_, state.leader_return)
         ends = state.episode % num_edits == 0  # of the evaluation of (g^M), then of each iteration
-        moves = ends & (leader_return > state.return_)
+        moves = ends & (leader_return >= state.return_)
         return GripsState(
             prompt=choose(moves, leader, state.prompt),
             return_=jnp.where(moves, leader_return, state.return_),
