@@ -27,7 +27,7 @@ class Distribution(Protocol):
     def mode(self) -> Array: ...
 
     def explore(self, key: PRNGKeyArray) -> Array:
-        """One of the things that the policy may do; unlike a sample, without noise on top."""
+        """An action for episodes that search: a sample, where the head cannot tell intention from noise."""
         ...
 
 

@@ -28,7 +28,7 @@ def rollout(
 
 
 def prompted(policy: Policy, query: Query) -> Agent:
-    """The agent that follows ``policy`` under one prompt, greedily or by sampling."""
+    """The agent that follows ``policy`` under one prompt, greedily or exploring."""
 
     def act(key: PRNGKeyArray, distribution: Any) -> Array:
         return jnp.where(query.greedy, distribution.mode(), distribution.explore(key))
