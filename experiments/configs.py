@@ -122,6 +122,7 @@ class Recipe:
     save_every: int = 500
     head: str | None = None
     standardize_obs: bool = False
+    obs_noise: float = 0.0
 
 
 # Demonstrations are cheaper than regularization: 10,000 of maze15 are soon overfitted, 100,000 take a
@@ -140,7 +141,7 @@ FAST = {
     "gridworld": Recipe(steps=3_000, episodes=68_000, max_prompt_length=8, bucket=8),
     # Long trajectories: half of them are enough for a gradient step.
     "kitchen": Recipe(
-        steps=6_000,
+        steps=5_000,
         episodes=9_000,
         max_prompt_length=6,
         bucket=32,
@@ -148,6 +149,7 @@ FAST = {
         part_steps=2048,
         head="mixture",
         standardize_obs=True,
+        obs_noise=0.03,
     ),
 }
 
@@ -177,6 +179,7 @@ def pretrain_preset(env: str, preset: str) -> PretrainConfig:
             batch_size=recipe.batch_size,
             part_steps=recipe.part_steps,
             bucket=recipe.bucket,
+            obs_noise=recipe.obs_noise,
         ),
         max_prompt_length=recipe.max_prompt_length,
         save_every=recipe.save_every,

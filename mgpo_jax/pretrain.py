@@ -48,6 +48,8 @@ class TrainConfig:
     """Weight decay [1e-4]."""
     clip_norm: float = 1.0
     """Largest global norm of the gradient [0.25*]."""
+    obs_noise: float = 0.0
+    """Largest standard deviation of Gaussian noise on training's observations, in their units [0]."""
     part_size: int = 16
     """Trajectories computed at once, over all devices; changes speed and memory, not the sum."""
     part_steps: int = 1024
@@ -131,15 +133,39 @@ def _block_matrices(params: Any) -> Any:
     return jax.tree_util.tree_map_with_path(kind, params)
 
 
+def blurred(key: PRNGKeyArray, trajectory: Trajectory, largest: float) -> Trajectory:
+    """The trajectory seen through noise of one size, uniform in [0, ``largest``].
+
+    A policy that saw only exact observations trusts their last digits; one that saw a single size of
+    noise does less well without any.
+    """
+    key_size, key_noise = jax.random.split(key)
+    size = largest * jax.random.uniform(key_size)
+    noise = size * jax.random.normal(key_noise, trajectory.obs.shape)
+    return trajectory._replace(obs=trajectory.obs + noise)
+
+
 def bc_loss(
     params: Any,
     key: PRNGKeyArray,
     network: GoalTransformer,
     trajectory: Trajectory,
     deterministic: bool = False,
+    obs_noise: float = 0.0,
 ) -> tuple[Float[Array, ""], Stats]:
-    """-sum_t log pi(a_t | p, h_{t-1}, o_t) of one trajectory, with p ~ P(p | tau) (Eq. 2)."""
+    """-sum_t log pi(a_t | p, h_{t-1}, o_t) of one trajectory, with p ~ P(p | tau) (Eq. 2).
+
+    Args:
+      params: weights of the network.
+      key: random key.
+      network: the policy's network.
+      trajectory: a demonstration, arrays of T steps.
+      deterministic: no dropout and no noise.
+      obs_noise: as in ``TrainConfig`` (static; not in the paper).
+    """
     key_prompt, key_dropout = jax.random.split(key)
+    if obs_noise and not deterministic:
+        trajectory = blurred(jax.random.fold_in(key, 0), trajectory, obs_noise)
     num_slots = network.config.max_prompt_length
     prompt = sample_prompt(key_prompt, trajectory, hindsight_outcome(trajectory), num_slots)
     distribution: Any = network.apply(
@@ -172,9 +198,11 @@ def make_trainer(
     """Build the training program for a dataset on a mesh.
 
     Raises:
-      ValueError: if the devices do not divide ``config.part_size``.
+      ValueError: if the devices do not divide ``config.part_size``, or ``config.obs_noise`` is negative.
     """
     num_devices = mesh.devices.size
+    if config.obs_noise < 0:
+        raise ValueError(f"obs_noise must not be negative, found {config.obs_noise}")
     if config.part_size % num_devices:
         raise ValueError(f"part_size {config.part_size} does not divide over {num_devices} devices")
     home = mesh.devices.flat[0]
@@ -199,7 +227,13 @@ def make_trainer(
     def batch_loss(
         params: Any, keys: Key[Array, "B"], part: Trajectory, deterministic: bool
     ) -> tuple[Array, Stats]:
-        loss = partial(bc_loss, params, network=network, deterministic=deterministic)
+        loss = partial(
+            bc_loss,
+            params,
+            network=network,
+            deterministic=deterministic,
+            obs_noise=config.obs_noise,
+        )
         nll, stats = jax.vmap(lambda key, one: loss(key, trajectory=one))(keys, part)
         return nll.sum(), jax.tree.map(jnp.sum, stats)
 

@@ -4,8 +4,9 @@ The paper trains one policy for each subtask with PPO and chains them (appendix 
 nor their data are public). Here every subtask is a short list of phases: move the arm to a pose in front of
 the object, approach, act along the arc of the object's joint, let go, retreat. Actions come from damped
 least squares on the arm's Jacobian with gravity fed forward. A phase that lost its object ends early, and a
-subtask that is not complete after its last phase starts again. Gaussian noise on the arm's actions
-spreads the data.
+subtask that is not complete after its last phase starts again. Gaussian noise on all nine actions
+spreads the data: a joint that were exact in every demonstration would teach a policy to trust its last
+digit.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from envs.kitchen.world import (
     KitchenTask,
 )
 
-NOISE = 0.08  # standard deviation on the arm's actions
+NOISE = 0.08  # standard deviation on the actions of arm and fingers
 OPEN, CLOSED = 0.04, 0.0  # m, of each finger
 
 STIFFNESS = np.array([870, 870, 870, 870, 120, 120, 120.0])  # of the position actuators, N m / rad
@@ -248,7 +249,7 @@ def make_scene(model_name: str) -> Scene:
 
 
 def scripted_arm(env: Kitchen, noise: float = NOISE) -> Agent:
-    """The demonstrator; ``noise`` is the standard deviation on the arm's seven actions."""
+    """The demonstrator; ``noise`` is the standard deviation on the nine actions."""
     from envs.kitchen.arm import Pose, arm_pose, make_arm, rotation_vector, turn
     from envs.kitchen.model import load_model
 
@@ -362,9 +363,9 @@ def scripted_arm(env: Kitchen, noise: float = NOISE) -> Agent:
         )
         wanted = (step / REACH + pose.gravity / STIFFNESS) / MAX_SHIFT
         arm_action = wanted / jnp.maximum(1.0, jnp.max(jnp.abs(wanted)))
-        arm_action += noise * jax.random.normal(key, (7,))
-        fingers = 4 * (current.grip - positions[7:NUM_ROBOT]) / MAX_SHIFT
-        action = jnp.clip(jnp.concatenate([arm_action, fingers]), -1.0, 1.0)
+        fingers = jnp.clip(4 * (current.grip - positions[7:NUM_ROBOT]) / MAX_SHIFT, -1.0, 1.0)
+        action = jnp.concatenate([arm_action, fingers])
+        action = jnp.clip(action + noise * jax.random.normal(key, (NUM_ROBOT,)), -1.0, 1.0)
         return action.astype(jnp.float32), jnp.zeros((), bool), memory
 
     return Agent(begin, proceed)
