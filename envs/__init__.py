@@ -13,9 +13,9 @@ __all__ = ["ENVIRONMENTS", "EnvSpec", "Environment", "TimeStep", "make"]
 
 
 def _kitchen(backend: str = "auto", model: str = "reduced") -> Environment:
-    from envs.kitchen import Kitchen, check_extra
+    from envs.kitchen import Kitchen, import_mujoco
 
-    check_extra()
+    import_mujoco()  # complains here, not in the middle of a program
     name = "kitchen-stock" if model == "stock" else "kitchen"
     return Kitchen(name=name, horizon=500, backend=backend, model=model)
 
@@ -39,7 +39,7 @@ def make(name: str) -> Environment:
 
     Raises:
       ValueError: with the nearest name, for one that does not exist.
-      ImportError: for a world whose optional packages are missing, with the command that installs them.
+      ImportError: for a world whose optional packages or libraries are missing, with the way to get them.
     """
     if name not in ENVIRONMENTS:
         near = difflib.get_close_matches(name, ENVIRONMENTS, n=1)

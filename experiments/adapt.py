@@ -86,7 +86,9 @@ class AdaptConfig(Common):
         return self.out or RUNS / "adapt" / self.env / f"{self.bandit}-seed{self.seed}"
 
 
-def summarize(config: AdaptConfig, outcome: Outcome, optimum: np.ndarray) -> dict[str, Any]:
+def summarize(
+    config: AdaptConfig, outcome: Outcome, optimum: np.ndarray, policy_sha256: str
+) -> dict[str, Any]:
     """The numbers of ``summary.json`` and of the printed table."""
     final = outcome.eval_returns[:, :, -1]
     regret = optimum - final
@@ -99,6 +101,7 @@ def summarize(config: AdaptConfig, outcome: Outcome, optimum: np.ndarray) -> dic
     return {
         "env": config.env,
         "optimizer": config.bandit,
+        "policy_sha256": policy_sha256,
         "num_tasks": final.shape[1],
         "num_seeds": final.shape[0],
         "num_episodes": config.episodes,
@@ -150,7 +153,12 @@ def table(summary: dict[str, Any]) -> str:
 
 
 def save_results(
-    folder: Path, config: AdaptConfig, outcome: Outcome, tasks: Task, optimum: np.ndarray
+    folder: Path,
+    config: AdaptConfig,
+    outcome: Outcome,
+    tasks: Task,
+    optimum: np.ndarray,
+    policy_sha256: str,
 ) -> dict[str, Any]:
     """Write raw results, tasks, summary and provenance to a new folder."""
     folder.mkdir(parents=True)
@@ -169,7 +177,7 @@ def save_results(
         optimal_returns=optimum,
     )
     save_tasks(folder / "tasks.npz", tasks)
-    summary = summarize(config, outcome, optimum)
+    summary = summarize(config, outcome, optimum, policy_sha256)
     write_json(folder / "config.json", config)
     write_json(folder / "meta.json", provenance())
     write_json(folder / "summary.json", summary)
@@ -228,7 +236,7 @@ def main(config: AdaptConfig) -> None:
         eval_episodes=config.eval_episodes,
         keep_rewarded=config.keep_rewarded,
     )
-    summary = save_results(folder, config, outcome, tasks, optimum)
+    summary = save_results(folder, config, outcome, tasks, optimum, network.sha256)
     print(table(summary))
     if config.figures:
         from experiments.plot import draw_run

@@ -169,6 +169,11 @@ def pretrain_preset(env: str, preset: str) -> PretrainConfig:
     world = make_env(env).spec.name  # complains about an unknown name
     if preset not in PRESETS:
         raise nearest(preset, PRESETS, "preset")
+    if world not in FAST:
+        raise UsageError(
+            f"there is no recipe for {world}: choose one of {', '.join(FAST)}, and act in {world} "
+            "with its policy (adapt --policy)"
+        )
     recipe = (PAPER if preset == "paper" else FAST)[world]
     fast = PretrainConfig(
         env=env,

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import tyro
 
+from envs.base import Environment
 from envs.noisy import Noisy
 from experiments.adaptation import NUM_EVAL_EPISODES, evaluate_prompts
 from experiments.configs import make_env, positive
-from experiments.policies import load_network
+from experiments.policies import LoadedPolicy, load_network_of
 from experiments.results import Results, load_results
-from experiments.runtime import Common, provenance, run, write_json
+from experiments.runtime import Common, provenance, refuse_existing, run, write_json
 from experiments.statistics import seed_spread
 from experiments.tasks import load_tasks
 from mgpo_jax.errors import UsageError
@@ -27,10 +30,13 @@ class EvaluateConfig(Common):
 
     runs: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Result folders of adaptations."""
-    obs_noise: float = 0.0
-    """Standard deviation of noise on observations, in their units."""
-    action_noise: float = 0.0
-    """Standard deviation of noise on actions; where they are discrete, the probability of a random one."""
+    env: str | None = None
+    """Evaluate in another world with the same tasks, such as kitchen-stock (default: where the prompts
+    were found)."""
+    obs_noise: tuple[float, ...] = ()
+    """Standard deviations of noise on observations, in their units; a row for each."""
+    action_noise: tuple[float, ...] = ()
+    """Standard deviations of noise on actions; where they are discrete, probabilities of a random one."""
     episodes: int = NUM_EVAL_EPISODES
     """Greedy episodes under each prompt."""
     seed: int = 0
@@ -39,69 +45,110 @@ class EvaluateConfig(Common):
     """Also write the rows to this file."""
 
 
-def noisy_world(config: EvaluateConfig, result: Results) -> Noisy:
-    """The world of an adaptation, with noise."""
+class Noise(NamedTuple):
+    """Its sizes on observations and on actions."""
+
+    obs: float = 0.0
+    action: float = 0.0
+
+    def __str__(self) -> str:
+        named = {"observations": self.obs, "actions": self.action}
+        return ", ".join(f"{name} {size:g}" for name, size in named.items() if size) or "none"
+
+
+class Case(NamedTuple):
+    """An adaptation, its network, and the world that its prompts go to."""
+
+    folder: Path
+    result: Results
+    env: Environment
+    network: LoadedPolicy
+
+
+def noises(config: EvaluateConfig) -> list[Noise]:
+    """What to evaluate under: each size by itself, or none."""
+    of_obs = [Noise(obs=size) for size in config.obs_noise]
+    return of_obs + [Noise(action=size) for size in config.action_noise] or [Noise()]
+
+
+def open_case(config: EvaluateConfig, folder: Path) -> Case:
+    """Read an adaptation, and check that its policy and tasks fit the world."""
+    result = load_results(folder)
+    env = make_env(config.env or result.config["env"])
+    return Case(folder, result, env, load_network_of(result, env))
+
+
+def noisy_world(env: Environment, noise: Noise) -> Noisy:
+    """The world behind noise, with the error of a command line."""
     try:
-        return Noisy(make_env(result.config["env"]), config.obs_noise, config.action_noise)
+        return Noisy(env, noise.obs, noise.action)
     except ValueError as error:
         raise UsageError(str(error)) from None
 
 
-def evaluate_run(
-    config: EvaluateConfig, folder: Path, result: Results, env: Noisy
-) -> dict[str, str | float]:
-    """The optimized prompts of one adaptation in its world with noise."""
-    path = result.config.get("policy")
-    network = load_network(env, path and Path(path))
-    prompts = Prompt(
-        jnp.asarray(result.best_goals[:, :, -1]), jnp.asarray(result.best_masks[:, :, -1])
-    )
-    returns, num_failed = evaluate_prompts(
-        env,
-        network,
-        load_tasks(folder / "tasks.npz", env),
-        prompts,
-        episodes=config.episodes,
-        seed=config.seed,
-    )
-    noisy, quiet = seed_spread(returns), seed_spread(result.eval_returns[:, :, -1])
-    return {
-        "env": result.config["env"],
-        "optimizer": result.config["bandit"],
-        "obs_noise": config.obs_noise,
-        "action_noise": config.action_noise,
-        "return": noisy.mean,
-        "std_over_seeds": noisy.std,
-        "without_noise": quiet.mean,
-        "change": noisy.mean - quiet.mean,
-        "failed_episodes": num_failed,
-    }
+def evaluate_case(config: EvaluateConfig, case: Case) -> Iterator[dict[str, Any]]:
+    """The optimized prompts of one adaptation, a row for each noise."""
+    result = case.result
+    last = (slice(None), slice(None), -1)
+    prompts = Prompt(jnp.asarray(result.best_goals[last]), jnp.asarray(result.best_masks[last]))
+    tasks = load_tasks(case.folder / "tasks.npz", case.env)
+    before = seed_spread(result.eval_returns[last])
+    for noise in noises(config):
+        returns, num_failed = evaluate_prompts(
+            noisy_world(case.env, noise),
+            case.network,
+            tasks,
+            prompts,
+            episodes=config.episodes,
+            seed=config.seed,
+        )
+        now = seed_spread(returns)
+        yield {
+            "env": config.env or result.config["env"],
+            "optimizer": result.config["bandit"],
+            "noise": str(noise),
+            "obs_noise": noise.obs,
+            "action_noise": noise.action,
+            "adapted": before.mean,
+            "return": now.mean,
+            "std_over_seeds": now.std,
+            "change": now.mean - before.mean,
+            "failed_episodes": num_failed,
+            "num_episodes": returns.size * config.episodes,
+        }
 
 
 def main(config: EvaluateConfig) -> None:
-    """Evaluate the optimized prompts of adaptations once more, under noise (Table 3)."""
+    """Evaluate the optimized prompts of adaptations once more, under noise (Table 3) or elsewhere."""
     positive(config, "episodes")
     if not config.runs:
         raise UsageError(
             "no result folder given; usage: python -m experiments.evaluate RUN_DIR ..."
         )
-    if min(config.obs_noise, config.action_noise) < 0:
+    if min(*config.obs_noise, *config.action_noise, 0.0, 0.0) < 0:
         raise UsageError("--obs-noise and --action-noise must not be negative")
-    if config.json and not config.json.parent.is_dir():
-        raise UsageError(f"no folder {config.json.parent} to write {config.json.name} to")
-    results = [load_results(folder) for folder in config.runs]
-    worlds = [noisy_world(config, result) for result in results]
-    head = ["env", "optimizer", "without noise", "with noise (mean ± std over seeds)", "change"]
+    if config.json:
+        if not config.json.parent.is_dir():
+            raise UsageError(f"no folder {config.json.parent} to write {config.json.name} to")
+        refuse_existing(config.json, "remove it", "choose another with --json")
+    cases = [open_case(config, folder) for folder in config.runs]
+    for case in cases:  # complain before the first row
+        for noise in noises(config):
+            noisy_world(case.env, noise)
+    head = ["env", "optimizer", "adapted", "noise", "return (mean ± std over seeds)", "change"]
     print(f"| {' | '.join(head)} |\n|{' --- |' * len(head)}")
     rows = []
-    for folder, result, env in zip(config.runs, results, worlds, strict=True):
-        row = evaluate_run(config, folder, result, env)
-        rows.append(row)
-        print(
-            f"| {row['env']} | {row['optimizer']} | {row['without_noise']:.3f} "
-            f"| {row['return']:.3f} ± {row['std_over_seeds']:.3f} | {row['change']:+.3f} |",
-            flush=True,
-        )
+    for case in cases:
+        for row in evaluate_case(config, case):
+            rows.append(row)
+            print(
+                f"| {row['env']} | {row['optimizer']} | {row['adapted']:.3f} | {row['noise']} "
+                f"| {row['return']:.3f} ± {row['std_over_seeds']:.3f} | {row['change']:+.3f} |",
+                flush=True,
+            )
+    if num_failed := sum(row["failed_episodes"] for row in rows):
+        total = sum(row["num_episodes"] for row in rows)
+        print(f"{num_failed} of {total} episodes ended because the world broke down")
     if config.json:
         write_json(config.json, {"rows": rows, **provenance()})
         print(f"rows in {config.json}", file=sys.stderr)

@@ -14,10 +14,11 @@ import tyro
 from experiments.configs import make_env
 from experiments.figures import STYLE, learning_curve, pictures
 from experiments.figures.base import Save
+from experiments.policies import load_network_of
 from experiments.results import Results, load_results
 from experiments.runtime import Common, run
 from mgpo_jax.errors import UsageError
-from mgpo_jax.policy import Policy
+from mgpo_jax.policy import Policy, transformer_policy
 
 
 @dataclass(frozen=True)
@@ -95,11 +96,8 @@ def _check_together(config: PlotConfig, folders: Mapping[Path, Results]) -> None
 
 
 def _load(result: Results) -> Policy:
-    from experiments.policies import load_policy
-
-    path = result.config.get("policy")
-    _, policy = load_policy(result.config["env"], path and Path(path))
-    return policy
+    network = load_network_of(result, make_env(result.config["env"]))
+    return transformer_policy(network.config, network.params)
 
 
 def _save(save: Save, path: Path) -> None:

@@ -7,7 +7,10 @@ from typing import Any, NamedTuple
 
 from envs.base import Environment
 from experiments.configs import PRETRAINED, make_env
-from mgpo_jax.checkpoint import load_policy_files
+from experiments.results import Results
+from mgpo_jax.checkpoint import WEIGHTS, load_policy_files
+from mgpo_jax.dataset import hash_file
+from mgpo_jax.errors import DataError
 from mgpo_jax.policy import Policy, transformer_policy
 from mgpo_jax.transformer import TransformerConfig
 
@@ -18,6 +21,8 @@ class LoadedPolicy(NamedTuple):
     config: TransformerConfig
     params: Any
     made: dict[str, Any]
+    sha256: str = ""
+    """Of the file of weights; none for those that were never on disk."""
 
 
 def released_folder(env_name: str) -> Path:
@@ -27,7 +32,27 @@ def released_folder(env_name: str) -> Path:
 
 def load_network(env: Environment, path: Path | None) -> LoadedPolicy:
     """The network in ``path`` (default: the released one), checked against the world."""
-    return LoadedPolicy(*load_policy_files(path or released_folder(env.spec.name), env.spec))
+    folder = path or released_folder(env.spec.name)
+    return LoadedPolicy(*load_policy_files(folder, env.spec), hash_file(folder / WEIGHTS))
+
+
+def load_network_of(result: Results, env: Environment) -> LoadedPolicy:
+    """The network that an adaptation was made with, checked against ``env``.
+
+    Raises:
+      DataError: if there are other weights at its place by now, or it does not fit the world.
+    """
+    path = result.config.get("policy")
+    folder = Path(path) if path else released_folder(make_env(result.config["env"]).spec.name)
+    network = load_network(env, folder)
+    made_with = result.summary.get("policy_sha256", network.sha256)
+    if network.sha256 != made_with:
+        raise DataError(
+            f"the weights in {folder} ({network.sha256[:12]}) are not those that the prompts of "
+            f"{result.config['env']} {result.config['bandit']} were found with ({made_with[:12]}): "
+            "adapt again with `python -m experiments.adapt`"
+        )
+    return network
 
 
 def load_policy(env_name: str, path: Path | None = None) -> tuple[Environment, Policy]:

@@ -33,6 +33,7 @@ from mgpo_jax.errors import UsageError, nearest
 from mgpo_jax.optimizers import ucb
 
 EPISODES = 100  # of an adaptation
+LONGEST = 5  # goals of a prompt where the paper varies c
 # Gradient steps of each training of a table, and its trajectories.
 STEPS = {"maze15": 2_000, "maze30": 1_000, "kitchen": 1_000}
 TRAJECTORIES = {"maze15": 10_000, "maze30": 10_000, "kitchen": 9_000}
@@ -164,9 +165,10 @@ def adapted(
     env = make_env(config.env)
     tasks = benchmark_tasks(env)
     print(f"adapting with {policy or 'the released policy'}", file=sys.stderr)
+    network = load_network(env, policy)
     outcomes = run_variants(
         env,
-        load_network(env, policy),
+        network,
         partial(ucb, scale=scale),
         tasks,
         list(folders.values()),
@@ -186,14 +188,17 @@ def adapted(
             out=folder,
             options=OptimizerConfig(c=variant.get("c"), scale=scale),
         )
-        save_results(folder, adapt, outcome, tasks, optimum)
+        save_results(folder, adapt, outcome, tasks, optimum, network.sha256)
 
 
 def table4(config: ReproduceConfig) -> list[Line]:
     """Longest prompt K and exploration constant c, with the released policy (Table 4)."""
     folder, paper = config.folder / "table4", PAPER[config.env]
-    lengths = {folder / f"K{k}-{config.seeds}seeds": {"max_goals": k} for k in (1, 2, 3, 5)}
-    constants = {folder / f"c{c}-{config.seeds}seeds": {"c": float(c)} for c in (0, 1, 10)}
+    lengths = {folder / f"K{k}-{config.seeds}seeds": {"max_goals": k} for k in (1, 2, 3, LONGEST)}
+    constants = {
+        folder / f"c{c}-{config.seeds}seeds": {"c": float(c), "max_goals": LONGEST}
+        for c in (0, 1, 10)
+    }
     adapted(config, None, lengths)
     adapted(config, None, constants, scale=1.0)  # Eq. 3 as printed
     lines = [(f"K = {variant['max_goals']}", path) for path, variant in lengths.items()]

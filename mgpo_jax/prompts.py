@@ -81,14 +81,14 @@ def sample_prompt(
     num_drawn = min(num_slots - 1, num_steps)
     rank = jnp.arange(num_drawn)
     scores = jnp.where(eligible, jax.random.uniform(key_index, (num_steps,)), -1.0)
-    place = time
     if kept is not None:
         scores = jnp.where(kept, 2.0, scores)
-        shuffled = num_steps + jax.random.permutation(jax.random.fold_in(key_index, 0), num_steps)
-        place = jnp.where(time > jnp.max(jnp.where(kept, time, -1)), shuffled, time)
     _, drawn = jax.lax.top_k(scores, num_drawn)
-    used = rank < count
-    order = jnp.argsort(jnp.where(used, place[drawn], -1))  # unused slots first
+    used, place = rank < count, drawn
+    if kept is not None:
+        # Those after the last kept step stay as they were drawn: at random.
+        place = jnp.where(drawn > jnp.max(jnp.where(kept, time, -1)), num_steps + rank, drawn)
+    order = jnp.argsort(jnp.where(used, place, -1))  # unused slots first
     drawn, used = drawn[order], used[order]
 
     empty = num_slots - 1 - num_drawn

@@ -31,6 +31,16 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
                 item.add_marker(pytest.mark.skip(reason="slow: pass --all"))
 
 
+def require_kitchen() -> None:
+    """Skip the module that calls this where the kitchen cannot run."""
+    from envs.kitchen import import_mujoco
+
+    try:
+        import_mujoco()
+    except ImportError as error:
+        pytest.skip(str(error), allow_module_level=True)
+
+
 @pytest.fixture
 def key() -> jax.Array:
     return jax.random.key(0)

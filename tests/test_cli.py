@@ -17,7 +17,7 @@ import pytest
 import tyro
 
 import envs
-from experiments import adapt, collect, evaluate, pretrain, release, runtime
+from experiments import adapt, collect, evaluate, plot, pretrain, release, runtime
 from experiments.adapt import AdaptConfig
 from experiments.collect import CollectConfig
 from experiments.configs import PretrainConfig, pretrain_default, pretrain_preset
@@ -25,7 +25,7 @@ from experiments.evaluate import EvaluateConfig
 from experiments.release import ReleaseConfig
 from experiments.tasks import benchmark_tasks, load_tasks, sample_tasks, save_tasks, task_hashes
 from mgpo_jax.checkpoint import load_policy_files
-from mgpo_jax.dataset import load_dataset
+from mgpo_jax.dataset import hash_file, load_dataset
 
 Run = Callable[..., tuple[int, str]]
 
@@ -46,6 +46,7 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
         "adapt": (tyro.conf.OmitArgPrefixes[AdaptConfig], adapt.main),
         "evaluate": (EvaluateConfig, evaluate.main),
         "release": (ReleaseConfig, release.main),
+        "plot": (plot.PlotConfig, plot.main),
     }
 
     def call(line: str) -> tuple[int, str]:
@@ -111,7 +112,9 @@ POLICY = RUN / "policy"
         ("collect --episodes 0", 2, "--episodes must be at least 1"),
         ("evaluate", 2, "no result folder given"),
         ("evaluate nowhere --obs-noise -1", 2, "must not be negative"),
+        ("evaluate nowhere --action-noise 0.1 -1", 2, "must not be negative"),
         ("evaluate nowhere", 1, "no result folder nowhere"),
+        ("pretrain --obs-noise -1", 2, "--obs-noise must not be negative"),
     ],
 )
 def test_usage_errors_name_the_mend(command: Run, line: str, code: int, says: str) -> None:
@@ -257,8 +260,44 @@ def test_adapt_writes_what_it_prints(
     code, text = command("evaluate result --episodes 1 --json noise.json")
     assert code == 0, text
     (row,) = json.loads(Path("noise.json").read_text())["rows"]
+    assert row["noise"] == "none"
     assert row["return"] == pytest.approx(summary["final_return"])
     assert row["change"] == pytest.approx(0, abs=1e-5)
+    assert command("evaluate result --json noise.json")[0] == 2  # it is there already
+
+
+def test_evaluate_under_noise(command: Run, workspace: Path) -> None:
+    save_tasks(Path("mine.npz"), sample_tasks(envs.make("maze15"), 5, 3))
+    code, text = command(
+        f"adapt --policy {POLICY} --episodes 2 --tasks mine.npz --out result --no-figures"
+    )
+    assert code == 0, text
+    summary = json.loads(Path("result/summary.json").read_text())
+    code, text = command(
+        "evaluate result --episodes 1 --obs-noise 0.5 0 --action-noise 1 --json noises.json"
+    )
+    assert code == 0, text
+    rows = json.loads(Path("noises.json").read_text())["rows"]
+    noises = ["observations 0.5", "none", "actions 1"]
+    assert [row["noise"] for row in rows] == noises
+    assert rows[1]["return"] == pytest.approx(summary["final_return"])
+
+
+def test_results_know_the_weights_they_were_made_with(command: Run, workspace: Path) -> None:
+    code, text = command(f"adapt --policy {POLICY} --seeds 1 --episodes 2 --out result")
+    assert code == 0, text
+    weights, config = POLICY / "weights.npz", POLICY / "config.json"
+    assert json.loads(Path("result/summary.json").read_text())["policy_sha256"] == hash_file(
+        weights
+    )
+    with np.load(weights) as file:
+        other = {name: array + 1 for name, array in file.items()}
+    np.savez(weights, allow_pickle=False, **other)
+    config.write_text(json.dumps({**json.loads(config.read_text()), "sha256": hash_file(weights)}))
+    for line in ("evaluate result --episodes 1", "plot result"):
+        code, text = command(line)
+        assert code == 1
+        assert "not those that the prompts of maze15 ucb were found with" in text
 
 
 def test_prompts_longer_than_trained(command: Run, workspace: Path) -> None:
@@ -381,7 +420,7 @@ def test_a_continuous_world_from_data_to_release(
     code, text = command("evaluate result --obs-noise 0.05 --episodes 1 --json rows.json")
     assert code == 0, text
     (row,) = json.loads(Path("rows.json").read_text())["rows"]
-    assert row["change"] == pytest.approx(row["return"] - row["without_noise"])
+    assert row["change"] == pytest.approx(row["return"] - row["adapted"])
     assert row["failed_episodes"] == 0
     assert command("release run --out packed") == (0, "released in packed\n")
     assert "share within 0.1 in all dimensions" in Path("packed/README.md").read_text()

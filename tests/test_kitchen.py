@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -14,13 +15,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import require_kitchen
 from jax.sharding import PartitionSpec
 
-from envs.kitchen import NONE, SUBTASKS, Kitchen, KitchenTask, MissingExtraError, extra
+from envs.kitchen import (
+    NONE,
+    SUBTASKS,
+    Kitchen,
+    KitchenTask,
+    MissingExtraError,
+    NoOpenGLError,
+    extra,
+)
+from experiments.runtime import jit_with
 from mgpo_jax.sharding import device_mesh
 
-mujoco = pytest.importorskip("mujoco")
-pytest.importorskip("mujoco.mjx")
+require_kitchen()
+import mujoco  # noqa: E402
 
 HORIZON = 500
 WORLD = Kitchen(name="kitchen", horizon=HORIZON)
@@ -138,6 +149,13 @@ class TestRules:
         np.testing.assert_array_equal(second.goal, multi_hot([HINGE]))
         assert first.reward == second.reward == 0.5
 
+    def test_of_two_at_once_the_next_of_the_task_counts_first(self):
+        state, first = wait(put(begin([HINGE, SLIDE]), SLIDE, HINGE))
+        _, second = wait(state)
+        np.testing.assert_array_equal(first.goal, multi_hot([HINGE]))
+        np.testing.assert_array_equal(second.goal, multi_hot([SLIDE]))
+        assert first.reward == second.reward == 0.5
+
     def test_the_horizon_truncates_and_absorbs(self):
         short = Kitchen(name="short", horizon=3)
         state = begin([LIGHT], short)
@@ -225,9 +243,7 @@ class TestBadInput:
             return "3.17.0"
 
         monkeypatch.setattr(extra, "version", version)
-        with pytest.raises(
-            MissingExtraError, match=rf'{package}: pip install "mgpo-jax\[kitchen\]"'
-        ):
+        with pytest.raises(MissingExtraError, match=rf'{package}: pip install -e "\.\[kitchen\]"'):
             extra.check_extra()
 
     def test_a_wrong_pair(self, monkeypatch):
@@ -279,6 +295,29 @@ class TestBadInput:
         alone, _ = stepper(WORLD)(begin([LIGHT]), jnp.zeros(9))
         np.testing.assert_array_equal(after.physics.qpos[0], alone.physics.qpos)
         assert not Path("MUJOCO_LOG.TXT").exists()
+
+
+@pytest.mark.parametrize("library", ["nonsense", "osmesa"])
+def test_an_opengl_that_is_not_there(library):
+    """MuJoCo looks for it when it is imported."""
+    code = (
+        "import ctypes, ctypes.util as util; util.find_library = lambda name: None\n"
+        "import envs\ntry: envs.make('kitchen')\n"
+        "except ImportError as error: print(type(error).__name__, error)\n"
+        "else: print('found')"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "MUJOCO_GL": library},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert found.stdout.startswith(NoOpenGLError.__name__) or (
+        library == "osmesa" and found.stdout == "found\n"
+    )
+    if library == "nonsense":
+        assert "found MUJOCO_GL=nonsense" in found.stdout
 
 
 def test_other_worlds_do_not_load_physics():
@@ -383,6 +422,27 @@ class TestOracle:
             counts += expected
         assert (counts > 5).all()
         assert (counts < 35).all()
+
+
+def test_one_step_of_mjx_is_one_of_native():
+    actions = random_actions(5, 3)
+    after = [
+        jit_with(env)(
+            jax.vmap(lambda action, env=env: env.step(begin([LIGHT], env), action)[1].obs)
+        )(actions)
+        for env in (WORLD, Kitchen("kitchen", HORIZON, "mjx"))
+    ]
+    np.testing.assert_allclose(*after, atol=5e-3)
+    assert np.median(np.abs(after[0] - after[1])) < 1e-5
+
+
+def test_accelerators_call_c_through_a_pure_callback(monkeypatch):
+    state, action = begin([LIGHT]), jnp.asarray(random_actions(6))
+    expected, _ = stepper(WORLD)(state, action)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    found, _ = jax.jit(Kitchen("kitchen", HORIZON, "native").step)(state, action)
+    for one, other in zip(found.physics, expected.physics, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.slow

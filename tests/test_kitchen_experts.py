@@ -7,12 +7,13 @@ from functools import cache
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
+from conftest import require_kitchen
 
 from envs.experts import demonstrators
 from envs.kitchen import NONE, SUBTASKS, Kitchen, KitchenTask
 
-mujoco = pytest.importorskip("mujoco")
+require_kitchen()
+import mujoco  # noqa: E402
 
 from envs.experts.kitchen import HIGH, LOW, make_plan, scripted_arm  # noqa: E402
 from envs.kitchen.arm import PAD, arm_pose, make_arm, rotation_vector, turn  # noqa: E402

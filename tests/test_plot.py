@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 
 import imageio.v3 as iio
 import jax
@@ -377,8 +375,7 @@ def test_a_folder_that_is_not_there(tmp_path):
 @pytest.fixture
 def no_checkpoint(monkeypatch):
     """The command with a policy made by hand."""
-    loader = SimpleNamespace(load_policy=lambda env_name, path: (ENV, NORTHWARD))
-    monkeypatch.setitem(sys.modules, "experiments.policies", loader)
+    monkeypatch.setattr(plot, "_load", lambda result: NORTHWARD)
 
 
 def test_command_draws_everything(tmp_path, no_checkpoint):

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import sys
 from itertools import pairwise
-from types import SimpleNamespace
 
 import imageio.v3 as iio
 import jax
@@ -283,8 +281,7 @@ def test_an_adaptation_draws_its_orders(tmp_path):
 
 
 def test_command_draws_everything(tmp_path, monkeypatch):
-    loader = SimpleNamespace(load_policy=lambda env_name, path: (ENV, flipping_policy()))
-    monkeypatch.setitem(sys.modules, "experiments.policies", loader)
+    monkeypatch.setattr(plot, "_load", lambda result: flipping_policy())
     run = save_results(tmp_path / "run", fake_results())
     plot.main(plot.PlotConfig(runs=(run,), out=tmp_path / "out", tasks=(1, 0)))
     drawn = {path.name: path for path in (tmp_path / "out").iterdir()}

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import envs
-from envs.kitchen import NONE
+from envs.kitchen import NONE, NoOpenGLError
 from envs.render import Panel
 from experiments import figures
 from experiments.figures import kitchen
@@ -52,7 +52,7 @@ def test_a_panel_names_what_was_completed_until_the_end():
     episode = Episode(trajectory, np.zeros(num), np.array(0.5))
     panel = kitchen.panel("A prompt", prompt_of(HINGE), episode)
     assert panel.title == "A prompt, return 0.50\nhinge"
-    assert panel.completed == [(1, "microwave"), (30, "light")]
+    assert panel.completed == [(2, "microwave"), (31, "light")]
     np.testing.assert_array_equal(panel.obs, obs[: 30 + kitchen.REST])
     none = trajectory._replace(goal_reached=np.zeros(num, bool))
     panel = kitchen.panel("A prompt", prompt_of(HINGE), episode._replace(trajectory=none))
@@ -104,7 +104,7 @@ def test_no_opengl_is_a_sentence(result, monkeypatch, tmp_path):
     pytest.importorskip("mujoco")
 
     def refuse(*args):
-        raise RuntimeError("no OpenGL to draw the kitchen with: install EGL or OSMesa")
+        raise NoOpenGLError(AttributeError("no library"))
 
     monkeypatch.setattr(kitchen, "kitchen_gif", refuse)
     with pytest.raises(UsageError, match="install EGL or OSMesa"):

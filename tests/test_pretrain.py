@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
-from scipy import special
+from scipy import special, stats
 
 from mgpo_jax.dataset import BatchPlan, Dataset
 from mgpo_jax.pretrain import (
@@ -18,12 +18,14 @@ from mgpo_jax.pretrain import (
     TrainState,
     batch_stream,
     bc_loss,
+    blurred,
     learning_rate_schedule,
     make_trainer,
 )
 from mgpo_jax.prompts import hindsight_outcome, sample_prompt
 from mgpo_jax.sharding import device_mesh
 from mgpo_jax.transformer import GoalTransformer, TransformerConfig
+from mgpo_jax.types import Trajectory
 
 HORIZON = 6
 NETWORK = TransformerConfig(
@@ -222,6 +224,46 @@ def test_schedules(schedule):
 def test_a_run_shorter_than_its_warm_up_still_reaches_the_peak():
     config = TrainConfig(steps=10, learning_rate=2e-3, warmup_steps=300, schedule="constant")
     assert float(learning_rate_schedule(config)(10)) == pytest.approx(2e-3)
+
+
+@pytest.fixture
+def long():
+    num = 1000
+    return Trajectory(
+        obs=jnp.zeros((num, 3)),
+        actions=jnp.zeros(num, jnp.int32),
+        goals=jnp.zeros((num, 2)),
+        goal_reached=jnp.zeros(num, bool),
+        outcomes=jnp.zeros((num, 2)),
+        length=jnp.int32(num),
+    )
+
+
+def test_noise_on_observations_has_one_size_a_trajectory(long):
+    keys = jax.random.split(jax.random.key(0), 400)
+    seen = jax.vmap(lambda key: blurred(key, long, 0.3))(keys)
+    noise = np.asarray(seen.obs - long.obs)
+    sizes = noise.std(axis=(1, 2))
+    assert stats.kstest(sizes, stats.uniform(0, 0.3).cdf).pvalue > 1e-3
+    assert stats.kstest((noise / sizes[:, None, None]).ravel()[::50], "norm").pvalue > 1e-3
+
+
+def test_noise_is_for_training_only(params):
+    """Neither held-out losses nor runs without it change."""
+    network = GoalTransformer(NETWORK)
+    one = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), DATASET.gather(*WHOLE))
+
+    def loss(deterministic, noise):
+        return float(bc_loss(params, jax.random.key(1), network, one, deterministic, noise)[0])
+
+    clean = loss(True, 0.0)
+    assert loss(True, 0.5) == loss(False, 0.0) == clean
+    assert loss(False, 0.5) != clean
+
+
+def test_noise_must_not_be_negative():
+    with pytest.raises(ValueError, match="obs_noise must not be negative, found -1"):
+        make_trainer(replace(CONFIG, obs_noise=-1.0), NETWORK, DATASET, device_mesh(1))
 
 
 def test_devices_must_divide_the_parts():

@@ -9,11 +9,14 @@ import sys
 import imageio.v3 as iio
 import numpy as np
 import pytest
+from conftest import require_kitchen
 
+from envs.kitchen import NoOpenGLError
 from envs.kitchen.world import POSITIONS
 from envs.render.kitchen import kitchen_frames
 
-mujoco = pytest.importorskip("mujoco")
+require_kitchen()
+import mujoco  # noqa: E402
 
 DRAW = """
 import sys, numpy as np
@@ -61,8 +64,8 @@ def test_frames_show_what_moved(tmp_path):
 
 def test_no_opengl(monkeypatch):
     def refuse(*args):
-        raise RuntimeError("an OpenGL platform library has not been loaded")
+        raise AttributeError("an OpenGL platform library has not been loaded")
 
     monkeypatch.setattr(mujoco, "Renderer", refuse)
-    with pytest.raises(RuntimeError, match=r"install EGL or OSMesa and set MUJOCO_GL=egl"):
+    with pytest.raises(NoOpenGLError, match=r"install EGL or OSMesa and set MUJOCO_GL=egl"):
         kitchen_frames(np.zeros((1, 59)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from envs.kitchen.extra import MissingExtraError, check_extra
+from envs.kitchen.extra import MissingExtraError, NoOpenGLError, check_extra, import_mujoco
 from envs.kitchen.world import NONE, SUBTASKS, Kitchen, KitchenState, KitchenTask
 
 __all__ = [
@@ -12,5 +12,7 @@ __all__ = [
     "KitchenState",
     "KitchenTask",
     "MissingExtraError",
+    "NoOpenGLError",
     "check_extra",
+    "import_mujoco",
 ]

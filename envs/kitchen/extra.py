@@ -7,16 +7,28 @@ Python code is not imported.
 from __future__ import annotations
 
 import importlib.util
+import os
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from types import ModuleType
 
-INSTALL = 'pip install "mgpo-jax[kitchen]"'
+INSTALL = 'pip install -e ".[kitchen]"'
 SCENE = Path("envs/assets/kitchen_franka/kitchen_assets/kitchen_env_model.xml")
 
 
 class MissingExtraError(ImportError):
     """Packages of the extra ``kitchen`` are missing or do not fit together."""
+
+
+class NoOpenGLError(ImportError):
+    """There is no OpenGL of the kind that ``MUJOCO_GL`` names."""
+
+    def __init__(self, cause: Exception) -> None:
+        super().__init__(
+            "no OpenGL to draw the kitchen with: install EGL or OSMesa and set MUJOCO_GL=egl or "
+            f"MUJOCO_GL=osmesa, found MUJOCO_GL={os.environ.get('MUJOCO_GL', '')} ({cause})"
+        )
 
 
 @cache
@@ -33,6 +45,23 @@ def check_extra() -> None:
             f"mujoco {mujoco} is too old to step many worlds at once; {INSTALL} installs one that can"
         )
     scene_path()
+
+
+def import_mujoco() -> ModuleType:
+    """The module ``mujoco``, which looks for the OpenGL that ``MUJOCO_GL`` names when it is imported.
+
+    Raises:
+      MissingExtraError: if the packages of the kitchen are missing.
+      NoOpenGLError: if that OpenGL is.
+    """
+    check_extra()
+    try:
+        import mujoco
+    except (AttributeError, ImportError, OSError, RuntimeError) as error:
+        if "MUJOCO_GL" in os.environ:
+            raise NoOpenGLError(error) from None
+        raise
+    return mujoco
 
 
 def scene_path() -> Path:

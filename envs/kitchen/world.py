@@ -207,13 +207,15 @@ class Kitchen:
         failed = ~valid | ~_is_sane(physics)
         physics = jax.tree.map(lambda old, new: jnp.where(failed, old, new), state.physics, physics)
 
-        # One subtask a step, so that goals are single ones; another would count a step later.
-        arrived = self._at_target(physics) & ~state.completed & ~failed
-        newly = arrived & (jnp.cumsum(arrived) == 1)
-        completed = state.completed | newly
         order, num_solved = state.task.order, state.num_solved
         num_subtasks = jnp.sum(order != NONE)
         place = jnp.arange(NUM_SUBTASKS)
+        # One subtask a step, so that goals are single ones: of two that arrive together the task's
+        # next one counts now and the other a step later.
+        arrived = self._at_target(physics) & ~state.completed & ~failed
+        expected = place == order[jnp.minimum(num_solved, NUM_SUBTASKS - 1)]
+        newly = arrived & (place == jnp.argmax(arrived * (1 + expected)))
+        completed = state.completed | newly
         # Complete: those solved and the next one; not complete: all later ones of the task.
         in_order = jnp.all((completed[order] == (place <= num_solved)) | (place >= num_subtasks))
         num_solved += in_order

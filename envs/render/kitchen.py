@@ -11,11 +11,12 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.figure import Figure
 
+from envs.kitchen import NoOpenGLError, import_mujoco
 from envs.kitchen.world import POSITIONS
 from envs.render.palette import INK, PAPER
 from envs.render.video import write_gif
 
-DPI, ABOVE, BELOW = 100, 62, 18  # pixels an inch; pixels of text above and below a picture
+DPI, HEAD, ROW, BELOW = 100, 22, 13, 18  # pixels an inch; pixels of text above and below a picture
 LINE = 52  # letters across a picture
 FRAMES = 75  # of a GIF
 GAP = 0.01  # between pictures, as a share of the width
@@ -28,14 +29,10 @@ def kitchen_frames(
     """What the scene looks like at each of these observations.
 
     Raises:
-      RuntimeError: where there is no OpenGL to draw with.
-      ImportError: if the packages of the kitchen are missing.
+      NoOpenGLError: where there is no OpenGL to draw with.
+      MissingExtraError: if the packages of the kitchen are missing.
     """
-    from envs.kitchen import check_extra
-
-    check_extra()
-    import mujoco
-
+    mujoco = import_mujoco()
     from envs.kitchen.model import load_model
 
     model = load_model("stock")
@@ -46,10 +43,7 @@ def kitchen_frames(
     try:
         renderer = mujoco.Renderer(model, height, width)
     except (AttributeError, ImportError, RuntimeError, mujoco.FatalError) as error:
-        raise RuntimeError(
-            "no OpenGL to draw the kitchen with: install EGL or OSMesa and set MUJOCO_GL=egl or "
-            f"MUJOCO_GL=osmesa ({error})"
-        ) from None
+        raise NoOpenGLError(error) from None
     for costly in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
         renderer.scene.flags[costly] = False
     with renderer:
@@ -68,7 +62,7 @@ class Panel(NamedTuple):
     title: str
     obs: Float[np.ndarray, "T 59"]
     completed: Sequence[tuple[int, str]]
-    """Steps after which something was completed, and what."""
+    """What was completed, and in which step, counted from 1."""
 
 
 def kitchen_gif(
@@ -77,17 +71,18 @@ def kitchen_gif(
     """Episodes side by side, at up to ``FRAMES`` of their times; those that end earlier stand still."""
     num_steps = max(len(panel.obs) for panel in panels)
     times = np.linspace(0, num_steps - 1, min(num_steps, FRAMES)).round().astype(int)
-    whole = ABOVE + height + BELOW
+    titles = ["\n".join(fill(line, LINE) for line in panel.title.splitlines()) for panel in panels]
+    above = HEAD + ROW * max(text.count("\n") + 1 for text in titles)
+    whole = above + height + BELOW
     size = len(panels) * width / DPI, whole / DPI
     figure = Figure(figsize=size, dpi=DPI, facecolor=PAPER)
     figure.text(0.5, 1 - 5 / whole, title, color=INK, fontsize=8.5, ha="center", va="top")
     drawn = []
-    for number, panel in enumerate(panels):
+    for number, (panel, text) in enumerate(zip(panels, titles, strict=True)):
         place = (number / len(panels), BELOW / whole, 1 / len(panels) - GAP, height / whole)
         axes = figure.add_axes(place)
         axes.set_axis_off()
-        lines = [fill(line, LINE) for line in panel.title.splitlines()]
-        axes.set_title("\n".join(lines), color=INK, fontsize=7.5, pad=2)
+        axes.set_title(text, color=INK, fontsize=7.5, pad=2)
         below = axes.text(0.5, -0.02, "", color=INK, fontsize=7.5, transform=axes.transAxes)
         below.set(ha="center", va="top")
         frames = kitchen_frames(panel.obs[np.minimum(times, len(panel.obs) - 1)], height, width)
@@ -96,7 +91,9 @@ def kitchen_gif(
     def show(index: int) -> None:
         for panel, (image, below, frames) in zip(panels, drawn, strict=True):
             image.set_data(frames[index])
-            done = [what for when, what in panel.completed if when <= times[index]]
-            below.set_text(f"step {min(times[index], len(panel.obs))}: {', '.join(done) or '-'}")
+            # A picture is of what a step, counted from 1, begins with.
+            steps = min(times[index] + 1, len(panel.obs))
+            done = [what for when, what in panel.completed if when <= steps]
+            below.set_text(f"step {steps}: {', '.join(done) or '-'}")
 
     write_gif(path, figure, show, len(times))

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.kitchen import NONE, Kitchen, KitchenTask
+from envs.kitchen import NONE, Kitchen, KitchenTask, NoOpenGLError
 from envs.render import Panel, kitchen_gif
 from experiments.figures.base import LoadPolicy, Pictures, Save, file_names, goals_of
 from experiments.results import Results
@@ -57,7 +57,7 @@ def before_and_after(
     order = [NAMES[subtask] for subtask in result.tasks["order"][index] if subtask != NONE]
     try:
         kitchen_gif(path, f"Task, in an order that is not told: {', '.join(order)}", panels)
-    except RuntimeError as error:
+    except NoOpenGLError as error:
         raise UsageError(str(error)) from None
 
 
@@ -65,7 +65,7 @@ def panel(name: str, prompt: Prompt, episode: Episode) -> Panel:
     """An episode as what it looked like, until soon after the last subtask was completed."""
     trajectory = jax.tree.map(np.asarray, episode.trajectory)
     times = np.flatnonzero(trajectory.goal_reached[: trajectory.length])
-    completed = [(int(time), NAMES[trajectory.goals[time].argmax()]) for time in times]
+    completed = [(int(time) + 1, NAMES[trajectory.goals[time].argmax()]) for time in times]
     end = min(trajectory.length, times[-1] + REST) if completed else trajectory.length
     title = f"{name}, return {float(episode.return_):.2f}\n{words(prompt)}"
     return Panel(title, trajectory.obs[:end], completed)
