@@ -135,3 +135,5 @@ class Demonstrator(NamedTuple):
     """``episode -> bool``; other demonstrations are dropped and tried again."""
     hindsight_return: Callable
     """``trajectory -> return`` on the task that the trajectory happens to solve."""
+    settings: tuple[tuple[str, float], ...] = ()
+    """Names and values of what else its data depends on; a dataset made with others is out of date."""

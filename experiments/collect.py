@@ -159,7 +159,13 @@ def main(config: CollectConfig) -> None:
     cpu = time.process_time()
     dataset, facts = collect(env, demonstrator, config.episodes, config.seed)
     cpu = time.process_time() - cpu
-    made = {"env": config.env, "policy": policy, "seed": config.seed, "versions": versions()}
+    made = {
+        "env": config.env,
+        "policy": policy,
+        "settings": dict(demonstrator.settings),
+        "seed": config.seed,
+        "versions": versions(),
+    }
     save_dataset(folder, dataset, {**made, **facts})
     length, return_ = facts["length"]["mean"], facts["hindsight_return"]["mean"]
     print(

@@ -100,7 +100,7 @@ def configured_network(
 
 def prepare_dataset(config: PretrainConfig, env: Environment) -> Dataset:
     """The run's dataset, collected first where it is not there yet; no test task is in it."""
-    policy, _ = find_demonstrator(env, config.data.demonstrator)
+    policy, demonstrator = find_demonstrator(env, config.data.demonstrator)
     wanted = CollectConfig(
         env=env.spec.name,
         policy=policy,
@@ -111,7 +111,13 @@ def prepare_dataset(config: PretrainConfig, env: Environment) -> Dataset:
     if not folder.exists():
         print(f"no dataset in {folder} yet: collecting {wanted.episodes} episodes", file=sys.stderr)
         collect_main(wanted)
-    dataset, _ = load_dataset(folder, env.spec)
+    dataset, manifest = load_dataset(folder, env.spec)
+    settings, made_with = dict(demonstrator.settings), manifest.get("settings", {})
+    if made_with != settings:
+        raise DataError(
+            f"{folder} was collected by the demonstrator with {made_with or 'no settings'}, which now "
+            f"has {settings or 'none'}; remove it, and it is collected again"
+        )
     if np.isin(dataset.task_hashes, task_hashes(env, benchmark_tasks(env))).any():
         raise DataError(f"{folder} holds a test task; remove it and collect it again")
     if config.holdout >= len(dataset):

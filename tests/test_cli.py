@@ -399,14 +399,16 @@ def test_a_continuous_world_from_data_to_release(
 
     monkeypatch.setattr(experts, "kitchen_demonstrators", of_single_subtasks)
     monkeypatch.setitem(envs.ENVIRONMENTS, "kitchen", lambda: Kitchen("kitchen", horizon=120))
-    code, text = command(
+    line = (
         "pretrain --env kitchen --preset smoke --episodes 24 --holdout 8 --embed-dim 8 "
         "--num-layers 1 --steps 4 --batch-size 8 --part-size 4 --bucket 60 --eval-tasks 2 "
-        "--eval-every 2 --save-every 2 --out run"
+        "--eval-every 2 --save-every 2"
     )
+    code, text = command(f"{line} --out run")
     assert code == 0, text
     network, _, _ = load_policy_files(Path("run/policy"))
     dataset, manifest = load_dataset(Path("data/kitchen/expert-24-seed0"))
+    assert manifest["settings"] == {"noise": experts.NOISE}
     assert network.head == "mixture"
     np.testing.assert_allclose(network.obs_mean, dataset.obs.mean(axis=0), atol=1e-3)
     assert manifest["failed_episodes"] == 0
@@ -424,3 +426,10 @@ def test_a_continuous_world_from_data_to_release(
     assert row["failed_episodes"] == 0
     assert command("release run --out packed") == (0, "released in packed\n")
     assert "share within 0.1 in all dimensions" in Path("packed/README.md").read_text()
+
+    path = Path("data/kitchen/expert-24-seed0/manifest.json")
+    path.write_text(json.dumps({**manifest, "settings": {"noise": 0.5}}))
+    code, text = command(f"{line} --out other")
+    assert code == 1
+    assert "was collected by the demonstrator with {'noise': 0.5}" in text
+    assert not Path("other").exists()

@@ -384,6 +384,7 @@ def kitchen_demonstrators(env: Kitchen) -> dict[str, Demonstrator]:
         agent=scripted_arm(env),
         keeps=lambda episode: episode.return_ > 0.999,  # complete, in order
         hindsight_return=hindsight_return,
+        settings=(("noise", NOISE),),
     )
     return {"expert": expert}
 
