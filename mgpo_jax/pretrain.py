@@ -163,9 +163,9 @@ def bc_loss(
       deterministic: no dropout and no noise.
       obs_noise: as in ``TrainConfig`` (static; not in the paper).
     """
-    key_prompt, key_dropout = jax.random.split(key)
+    key_prompt, key_dropout, key_noise = jax.random.split(key, 3)
     if obs_noise and not deterministic:
-        trajectory = blurred(jax.random.fold_in(key, 0), trajectory, obs_noise)
+        trajectory = blurred(key_noise, trajectory, obs_noise)
     num_slots = network.config.max_prompt_length
     prompt = sample_prompt(key_prompt, trajectory, hindsight_outcome(trajectory), num_slots)
     distribution: Any = network.apply(
