@@ -172,7 +172,7 @@ def pretrain_preset(env: str, preset: str) -> PretrainConfig:
     if world not in FAST:
         raise UsageError(
             f"there is no recipe for {world}: choose one of {', '.join(FAST)}, and act in {world} "
-            "with its policy (adapt --policy)"
+            "with the policy of that (adapt --policy)"
         )
     recipe = (PAPER if preset == "paper" else FAST)[world]
     fast = PretrainConfig(

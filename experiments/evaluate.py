@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import tyro
 
-from envs.base import Environment
+from envs.base import Environment, Task
 from envs.noisy import Noisy
 from experiments.adaptation import NUM_EVAL_EPISODES, evaluate_prompts
 from experiments.configs import make_env, positive
@@ -57,11 +57,11 @@ class Noise(NamedTuple):
 
 
 class Case(NamedTuple):
-    """An adaptation, its network, and the world that its prompts go to."""
+    """An adaptation, its tasks and network, and the world that its prompts go to."""
 
-    folder: Path
     result: Results
     env: Environment
+    tasks: Task
     network: LoadedPolicy
 
 
@@ -75,7 +75,8 @@ def open_case(config: EvaluateConfig, folder: Path) -> Case:
     """Read an adaptation, and check that its policy and tasks fit the world."""
     result = load_results(folder)
     env = make_env(config.env or result.config["env"])
-    return Case(folder, result, env, load_network_of(result, env))
+    tasks = load_tasks(folder / "tasks.npz", env)
+    return Case(result, env, tasks, load_network_of(result, env))
 
 
 def noisy_world(env: Environment, noise: Noise) -> Noisy:
@@ -91,13 +92,12 @@ def evaluate_case(config: EvaluateConfig, case: Case) -> Iterator[dict[str, Any]
     result = case.result
     last = (slice(None), slice(None), -1)
     prompts = Prompt(jnp.asarray(result.best_goals[last]), jnp.asarray(result.best_masks[last]))
-    tasks = load_tasks(case.folder / "tasks.npz", case.env)
     before = seed_spread(result.eval_returns[last])
     for noise in noises(config):
         returns, num_failed = evaluate_prompts(
             noisy_world(case.env, noise),
             case.network,
-            tasks,
+            case.tasks,
             prompts,
             episodes=config.episodes,
             seed=config.seed,

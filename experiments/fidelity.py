@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from envs.experts import demonstrators
-from envs.kitchen import SUBTASKS, Kitchen, check_extra
+from envs.kitchen import SUBTASKS, Kitchen, import_mujoco
 from envs.kitchen.physics import PhysicsState
 from envs.kitchen.world import POSITIONS, VELOCITIES
 from experiments.configs import positive
@@ -232,7 +232,7 @@ def main(config: FidelityConfig) -> None:
     """Compare the kitchen's models and engines with each other and with FrankaKitchen."""
     positive(config, "worlds", "steps", "demonstrations")
     try:
-        check_extra()
+        import_mujoco()
     except ImportError as error:
         raise UsageError(str(error)) from None
     found = recordings(config)

@@ -79,9 +79,7 @@ def _optional(module: str, extra: str) -> Any:
     try:
         return __import__(module)
     except ImportError:
-        raise UsageError(
-            f'{module} is not installed; run `pip install "mgpo-jax[{extra}]"`'
-        ) from None
+        raise UsageError(f'{module} is not installed; run `pip install -e ".[{extra}]"`') from None
 
 
 def configured_network(

@@ -25,9 +25,11 @@ class NoOpenGLError(ImportError):
     """There is no OpenGL of the kind that ``MUJOCO_GL`` names."""
 
     def __init__(self, cause: Exception) -> None:
+        name = os.environ.get("MUJOCO_GL")
+        found = f"found MUJOCO_GL={name}" if name else "MUJOCO_GL is not set"
         super().__init__(
             "no OpenGL to draw the kitchen with: install EGL or OSMesa and set MUJOCO_GL=egl or "
-            f"MUJOCO_GL=osmesa, found MUJOCO_GL={os.environ.get('MUJOCO_GL', '')} ({cause})"
+            f"MUJOCO_GL=osmesa; {found} ({cause})"
         )
 
 

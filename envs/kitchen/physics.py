@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from envs.kitchen.extra import check_extra
+from envs.kitchen.extra import import_mujoco
 
 BACKENDS = ("auto", "native", "mjx")
 MODELS = ("reduced", "stock")
@@ -75,8 +75,9 @@ def load_physics(backend: str, model: str) -> Physics:
 
     Raises:
       MissingExtraError: if the packages of the kitchen are missing or do not fit together.
+      NoOpenGLError: if the OpenGL that ``MUJOCO_GL`` names is missing.
     """
-    check_extra()
+    import_mujoco()  # complains before its first use
     if backend == "native":
         from envs.kitchen.native import native_physics
 
