@@ -147,7 +147,7 @@ FAST = {
         bucket=32,
         batch_size=32,
         part_steps=2048,
-        head="mixture",
+        head="binned",
         standardize_obs=True,
         obs_noise=0.03,
     ),

@@ -409,7 +409,7 @@ def test_a_continuous_world_from_data_to_release(
     network, _, _ = load_policy_files(Path("run/policy"))
     dataset, manifest = load_dataset(Path("data/kitchen/expert-24-seed0"))
     assert manifest["settings"] == {"noise": experts.NOISE}
-    assert network.head == "mixture"
+    assert network.head == "binned"
     np.testing.assert_allclose(network.obs_mean, dataset.obs.mean(axis=0), atol=1e-3)
     assert manifest["failed_episodes"] == 0
     code, text = command(
