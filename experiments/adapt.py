@@ -21,6 +21,7 @@ from experiments.runtime import Common, provenance, refuse_existing, run, write_
 from experiments.statistics import seed_spread, stratified_bootstrap_iqm
 from experiments.tasks import benchmark_tasks, load_tasks, save_tasks
 from mgpo_jax.errors import UsageError, nearest
+from mgpo_jax.files import new_folder
 from mgpo_jax.optimizers import OPTIMIZERS
 
 
@@ -49,14 +50,14 @@ class AdaptConfig(Common):
     """Settings of ``experiments.adapt``; values in brackets are the paper's."""
 
     env: str = "maze15"
-    """The world: maze15, maze30, gridworld or kitchen."""
+    """The world: maze15, maze30, gridworld or kitchen (kitchen-mjx, kitchen-native, kitchen-stock)."""
     bandit: str = "ucb"
     """The prompt optimizer: ucb, bpe, explore, grips or bbt."""
     policy: Path | None = None
     """Folder of a policy (default: the released one of the world)."""
     tasks: Path | None = None
-    """Your own tasks, an npz file; mazes: maze [N, S, S] with 1 = wall, goal [N, 2] row and column
-    (default: the test tasks of the world)."""
+    """Your own tasks, an npz file; mazes: maze [N, S, S] with 1 = wall, goal [N, 2] row and column;
+    kitchen: order [N, 5], subtasks 0 to 4 and -1 for none (default: the test tasks of the world)."""
     seeds: int = 3
     """Independent adaptations to each task [3]."""
     episodes: int = 100
@@ -161,26 +162,26 @@ def save_results(
     policy_sha256: str,
 ) -> dict[str, Any]:
     """Write raw results, tasks, summary and provenance to a new folder."""
-    folder.mkdir(parents=True)
     log = outcome.log
-    np.savez_compressed(
-        folder / "results.npz",
-        allow_pickle=False,
-        returns=log.returns,
-        greedy=log.greedy,
-        prompt_goals=log.prompts.goals,
-        prompt_masks=log.prompts.mask,
-        best_goals=log.best.goals,
-        best_masks=log.best.mask,
-        eval_episodes=outcome.eval_episodes,
-        eval_returns=outcome.eval_returns,
-        optimal_returns=optimum,
-    )
-    save_tasks(folder / "tasks.npz", tasks)
     summary = summarize(config, outcome, optimum, policy_sha256)
-    write_json(folder / "config.json", config)
-    write_json(folder / "meta.json", provenance())
-    write_json(folder / "summary.json", summary)
+    with new_folder(folder) as partial:
+        np.savez_compressed(
+            partial / "results.npz",
+            allow_pickle=False,
+            returns=log.returns,
+            greedy=log.greedy,
+            prompt_goals=log.prompts.goals,
+            prompt_masks=log.prompts.mask,
+            best_goals=log.best.goals,
+            best_masks=log.best.mask,
+            eval_episodes=outcome.eval_episodes,
+            eval_returns=outcome.eval_returns,
+            optimal_returns=optimum,
+        )
+        save_tasks(partial / "tasks.npz", tasks)
+        write_json(partial / "config.json", config)
+        write_json(partial / "meta.json", provenance())
+        write_json(partial / "summary.json", summary)
     return summary
 
 

@@ -9,8 +9,8 @@ from envs.base import Environment
 from experiments.configs import PRETRAINED, make_env
 from experiments.results import Results
 from mgpo_jax.checkpoint import WEIGHTS, load_policy_files
-from mgpo_jax.dataset import hash_file
 from mgpo_jax.errors import DataError
+from mgpo_jax.files import hash_file
 from mgpo_jax.policy import Policy, transformer_policy
 from mgpo_jax.transformer import TransformerConfig
 
@@ -45,14 +45,19 @@ def load_network_of(result: Results, env: Environment) -> LoadedPolicy:
     path = result.config.get("policy")
     folder = Path(path) if path else released_folder(make_env(result.config["env"]).spec.name)
     network = load_network(env, folder)
+    check_weights(result, network, folder, "adapt again with `python -m experiments.adapt`")
+    return network
+
+
+def check_weights(result: Results, network: LoadedPolicy, folder: Path, mend: str) -> None:
+    """Raise ``DataError`` if an adaptation was made with other weights than those in ``folder``."""
     made_with = result.summary.get("policy_sha256", network.sha256)
     if network.sha256 != made_with:
         raise DataError(
             f"the weights in {folder} ({network.sha256[:12]}) are not those that the prompts of "
             f"{result.config['env']} {result.config['bandit']} were found with ({made_with[:12]}): "
-            "adapt again with `python -m experiments.adapt`"
+            + mend
         )
-    return network
 
 
 def load_policy(env_name: str, path: Path | None = None) -> tuple[Environment, Policy]:

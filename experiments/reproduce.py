@@ -22,7 +22,7 @@ from experiments.adapt import AdaptConfig, OptimizerConfig, save_results
 from experiments.adaptation import run_variants
 from experiments.configs import RUNS, DataConfig, make_env, positive, pretrain_preset
 from experiments.figures import learning_curve
-from experiments.policies import load_network
+from experiments.policies import check_weights, load_network, released_folder
 from experiments.pretrain import main as pretrain
 from experiments.results import load_results
 from experiments.runtime import Common, run
@@ -160,25 +160,27 @@ def adapted(
       folders: result folders to write, with the variant (``c``, ``max_goals``) of each.
       scale: of ``ucb``.
     """
-    if all((folder / "summary.json").is_file() for folder in folders):
-        return
     env = make_env(config.env)
+    network = load_network(env, policy)
+    missing = {folder: variant for folder, variant in folders.items() if not folder.exists()}
+    for folder in folders.keys() - missing.keys():
+        place = policy or released_folder(env.spec.name)
+        check_weights(load_results(folder), network, place, f"remove {folder}")
+    if not missing:
+        return
     tasks = benchmark_tasks(env)
     print(f"adapting with {policy or 'the released policy'}", file=sys.stderr)
-    network = load_network(env, policy)
     outcomes = run_variants(
         env,
         network,
         partial(ucb, scale=scale),
         tasks,
-        list(folders.values()),
+        list(missing.values()),
         seeds=config.seeds,
         episodes=EPISODES,
     )
     optimum = np.asarray(jax.jit(jax.vmap(env.optimal_return))(tasks))
-    for (folder, variant), outcome in zip(folders.items(), outcomes, strict=True):
-        if (folder / "summary.json").is_file():
-            continue
+    for (folder, variant), outcome in zip(missing.items(), outcomes, strict=True):
         adapt = AdaptConfig(
             env=config.env,
             policy=policy,

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mgpo_jax.errors import DataError
+from mgpo_jax.files import load_arrays
 from mgpo_jax.types import Prompt
 
 
@@ -69,7 +68,7 @@ def load_results(folder: Path) -> Results:
     for name in FILES:
         if not (folder / name).is_file():
             raise DataError(f"{folder / name} is missing; is {folder} the folder of an adaptation?")
-    arrays, tasks = _load_arrays(folder / "results.npz"), _load_arrays(folder / "tasks.npz")
+    arrays, tasks = load_arrays(folder / "results.npz"), load_arrays(folder / "tasks.npz")
     config, summary = _load_object(folder / "config.json"), _load_object(folder / "summary.json")
     for name in ("env", "bandit"):
         if not isinstance(config.get(name), str):
@@ -102,15 +101,6 @@ def load_results(folder: Path) -> Results:
     return Results(
         **{name: arrays[name] for name in AXES}, tasks=tasks, config=config, summary=summary
     )
-
-
-def _load_arrays(path: Path) -> dict[str, np.ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return dict(file)
-    # TypeError: a lone array, whatever the name of its file says
-    except (OSError, EOFError, TypeError, ValueError, zipfile.BadZipFile, zlib.error):
-        raise DataError(f"{path} is not a readable npz file") from None
 
 
 def _load_object(path: Path) -> dict[str, Any]:

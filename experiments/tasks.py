@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 from envs.base import Environment, Task
 from mgpo_jax.dataset import hash_task
 from mgpo_jax.errors import DataError, UsageError
+from mgpo_jax.files import load_arrays
 
 # Streams of task seeds that never meet: test, evaluation while training; data seeds count from 0.
 TEST_SEED, EVAL_SEED = 1_000_003, 1_000_033
@@ -76,18 +76,14 @@ def load_tasks(path: Path, env: Environment) -> Task:
         raise UsageError(f"no task file {path}")
     example: Any = jax.eval_shape(env.sample_task, jax.random.key(0))
     fields = type(example)._fields
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = dict(file)
-    except (OSError, ValueError, zipfile.BadZipFile):
-        raise DataError(f"{path} is not a readable npz file") from None
+    arrays = load_arrays(path)
     if missing := [name for name in fields if name not in arrays]:
         raise DataError(
             f"{path} lacks {', '.join(missing)}; tasks of {env.spec.name} need the arrays "
             f"{', '.join(fields)}"
         )
     tasks = type(example)(*(arrays[name] for name in fields))
-    if len(tasks[0]) == 0:
+    if any(array.ndim == 0 or len(array) == 0 for array in tasks):
         raise DataError(f"{path} holds no tasks")
     try:
         env.check_task(tasks)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,9 +20,9 @@ import orbax.checkpoint as ocp
 from flax.traverse_util import flatten_dict, unflatten_dict
 
 from envs.base import EnvSpec
-from mgpo_jax.dataset import hash_file
 from mgpo_jax.distributions import HEADS
 from mgpo_jax.errors import DataError, UsageError, nearest
+from mgpo_jax.files import hash_file, load_arrays
 from mgpo_jax.pretrain import TrainState
 from mgpo_jax.prompts import single_goal
 from mgpo_jax.transformer import GoalTransformer, TransformerConfig
@@ -138,8 +137,8 @@ def load_policy_files(
     folder = Path(folder)
     if not (folder / CONFIG).is_file():
         raise UsageError(
-            f"no policy in {folder} ({CONFIG} is missing); train one with "
-            "`python -m experiments.pretrain` or give its folder with --policy"
+            f"no policy in {folder} ({CONFIG} is missing); give the folder of one with --policy or "
+            "train one with `python -m experiments.pretrain`"
         )
     try:
         document = json.loads((folder / CONFIG).read_text())
@@ -163,12 +162,7 @@ def load_policy_files(
     path = folder / WEIGHTS
     if not path.is_file() or hash_file(path) != document.get("sha256"):
         raise DataError(f"{path} is missing, truncated or differs from the hash in {CONFIG}")
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            flat = dict(file)
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        raise DataError(f"{path} cannot be read ({error})") from None
-
+    flat = load_arrays(path)
     expected = flatten_dict(_shapes(config), sep="/")
     for name in sorted(expected.keys() | flat.keys()):
         if name not in flat or name not in expected:

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +17,7 @@ import numpy as np
 
 from envs.base import EnvSpec
 from mgpo_jax.errors import DataError
+from mgpo_jax.files import hash_file, load_arrays, new_folder
 from mgpo_jax.types import Trajectory
 
 FORMAT = 1
@@ -75,28 +74,18 @@ def hash_task(fingerprint: np.ndarray) -> np.uint64:
     return np.frombuffer(digest.digest(), np.uint64)[0]
 
 
-def hash_file(path: Path) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def save_dataset(folder: Path, dataset: Dataset, manifest: dict[str, Any]) -> None:
     """Write a dataset; the folder appears only when it is complete."""
-    folder = Path(folder)
-    if folder.exists():
-        raise DataError(f"{folder} exists already; remove it or choose another place with --out")
-    partial = folder.with_name(f"{folder.name}.partial-{os.getpid()}")
-    partial.mkdir(parents=True)
-    np.savez_compressed(partial / ARRAYS, allow_pickle=False, **vars(dataset))
-    manifest = {
-        "format": FORMAT,
-        "sha256": hash_file(partial / ARRAYS),
-        "num_trajectories": len(dataset),
-        "num_steps": int(dataset.lengths.sum()),
-        **manifest,
-    }
-    (partial / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n")
-    partial.rename(folder)
+    with new_folder(Path(folder)) as partial:
+        np.savez_compressed(partial / ARRAYS, allow_pickle=False, **vars(dataset))
+        manifest = {
+            "format": FORMAT,
+            "sha256": hash_file(partial / ARRAYS),
+            "num_trajectories": len(dataset),
+            "num_steps": int(dataset.lengths.sum()),
+            **manifest,
+        }
+        (partial / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n")
 
 
 def load_dataset(folder: Path, spec: EnvSpec | None = None) -> tuple[Dataset, dict[str, Any]]:
@@ -127,9 +116,8 @@ def load_dataset(folder: Path, spec: EnvSpec | None = None) -> tuple[Dataset, di
     if not path.is_file() or hash_file(path) != manifest.get("sha256"):
         raise DataError(f"{path} is missing or differs from the hash in its manifest; {remake}")
     try:
-        with np.load(path, allow_pickle=False) as file:
-            dataset = Dataset(**file)
-    except (OSError, EOFError, ValueError, TypeError, KeyError, zipfile.BadZipFile):
+        dataset = Dataset(**load_arrays(path))
+    except (DataError, TypeError):
         raise DataError(f"{path} does not hold the arrays of a dataset; {remake}") from None
     check_dataset(dataset, path, spec)
     return dataset, manifest
@@ -174,6 +162,8 @@ def check_dataset(dataset: Dataset, where: Path | str, spec: EnvSpec | None = No
         0 <= dataset.actions.min() <= dataset.actions.max() < spec.action_dim
     ):
         raise DataError(f"{where}: actions must lie in 0..{spec.action_dim - 1}")
+    if not spec.discrete and np.abs(dataset.actions).max() > 1:
+        raise DataError(f"{where}: actions must lie in [-1, 1]; clip them")
     if dataset.lengths.max() > spec.horizon:
         raise DataError(
             f"{where}: a trajectory has {dataset.lengths.max()} steps, "

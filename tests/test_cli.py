@@ -25,7 +25,8 @@ from experiments.evaluate import EvaluateConfig
 from experiments.release import ReleaseConfig
 from experiments.tasks import benchmark_tasks, load_tasks, sample_tasks, save_tasks, task_hashes
 from mgpo_jax.checkpoint import load_policy_files
-from mgpo_jax.dataset import hash_file, load_dataset
+from mgpo_jax.dataset import load_dataset
+from mgpo_jax.files import hash_file
 
 Run = Callable[..., tuple[int, str]]
 
@@ -91,6 +92,7 @@ def workspace(tiny_run: Path, tmp_path: Path) -> Path:
 
 RUN = Path("runs/pretrain/maze15/smoke-seed0")
 POLICY = RUN / "policy"
+RESULT = Path(__file__).parents[1] / "results/maze15/ucb"
 
 
 @pytest.mark.parametrize(
@@ -111,10 +113,12 @@ POLICY = RUN / "policy"
         ("collect --policy astr4", 2, "did you mean 'astar4'"),
         ("collect --episodes 0", 2, "--episodes must be at least 1"),
         ("evaluate", 2, "no result folder given"),
-        ("evaluate nowhere --obs-noise -1", 2, "must not be negative"),
-        ("evaluate nowhere --action-noise 0.1 -1", 2, "must not be negative"),
+        (f"evaluate {RESULT} --obs-noise -1", 2, "noise must be finite and not negative"),
+        (f"evaluate {RESULT} --obs-noise nan", 2, "noise must be finite and not negative"),
+        (f"evaluate {RESULT} --action-noise 0.1 -1", 2, "noise must be finite and not negative"),
         ("evaluate nowhere", 1, "no result folder nowhere"),
-        ("pretrain --obs-noise -1", 2, "--obs-noise must not be negative"),
+        ("pretrain --obs-noise -1", 2, "--obs-noise must be finite and not negative"),
+        ("pretrain --obs-noise nan", 2, "--obs-noise must be finite and not negative"),
     ],
 )
 def test_usage_errors_name_the_mend(command: Run, line: str, code: int, says: str) -> None:
@@ -346,10 +350,17 @@ def test_bad_task_files(
 
 def test_task_file_that_is_missing_or_no_npz(command: Run, workspace: Path) -> None:
     assert command(f"adapt --policy {POLICY} --tasks none.npz")[0] == 2
-    Path("text.npz").write_text("no")
-    code, text = command(f"adapt --policy {POLICY} --tasks text.npz")
-    assert code == 1
-    assert "not a readable npz" in text
+    for content in (b"no", b"", b"\x93NUMPY"):
+        Path("text.npz").write_bytes(content)
+        code, text = command(f"adapt --policy {POLICY} --tasks text.npz")
+        assert code == 1
+        assert "not a readable npz" in text
+
+
+def test_task_file_of_single_numbers(command: Run, workspace: Path) -> None:
+    np.savez("bad.npz", maze=1, goal=2)
+    code, text = command(f"adapt --policy {POLICY} --tasks bad.npz")
+    assert (code, "bad.npz holds no tasks" in text) == (1, True), text
 
 
 def test_tasks_survive_the_file(tmp_path: Path) -> None:

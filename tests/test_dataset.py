@@ -18,13 +18,13 @@ from mgpo_jax.dataset import (
     MANIFEST,
     Dataset,
     check_dataset,
-    hash_file,
     hash_task,
     load_dataset,
     plan_batches,
     save_dataset,
 )
 from mgpo_jax.errors import DataError
+from mgpo_jax.files import hash_file
 from mgpo_jax.types import Trajectory
 
 SPEC = EnvSpec(
@@ -339,6 +339,14 @@ def test_pickled_arrays_are_never_loaded(folder):
     rewrite(folder, lambda arrays: arrays.update(actions=np.array([{}] * 17, object)))
     with pytest.raises(DataError, match="does not hold the arrays"):
         load_dataset(folder)
+
+
+def test_continuous_actions_have_bounds(dataset):
+    spec = replace(SPEC, discrete=False)
+    actions = np.linspace(-1, 1, 17 * 4, dtype=np.float32).reshape(17, 4)
+    check_dataset(replace(dataset, actions=actions), "here", spec)
+    with pytest.raises(DataError, match=r"here: actions must lie in \[-1, 1\]"):
+        check_dataset(replace(dataset, actions=1.01 * actions), "here", spec)
 
 
 def test_check_without_a_world_accepts_any_sizes(dataset):

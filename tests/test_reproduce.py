@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from experiments.configs import PretrainConfig, pretrain_preset
 from experiments.reproduce import ReproduceConfig, main
 from experiments.results import load_results
 from experiments.tasks import benchmark_tasks
-from mgpo_jax.errors import UsageError
+from mgpo_jax.errors import DataError, UsageError
 
 
 def tiny_preset(env: str, preset: str) -> PretrainConfig:
@@ -64,6 +65,11 @@ def test_table5_from_data_to_table(tiny: Path, monkeypatch: pytest.MonkeyPatch) 
     (folder / "table5.md").unlink()
     main(config)
     assert (folder / "table5.md").read_text() == text
+
+    summary = folder / "table5" / "astar2-k5-2steps-24episodes-1seeds" / "summary.json"
+    summary.write_text(json.dumps({**json.loads(summary.read_text()), "policy_sha256": "0" * 64}))
+    with pytest.raises(DataError, match=r"are not those .* \(0{12}\): remove .*1seeds"):
+        main(config)
 
 
 def test_a_stopped_training_goes_on(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
