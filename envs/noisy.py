@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -34,9 +35,9 @@ class Noisy(Wrapper):
     action_noise: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.obs_noise < 0 or self.action_noise < 0:
+        if not all(0 <= size < math.inf for size in (self.obs_noise, self.action_noise)):
             raise ValueError(
-                f"noise must not be negative, found {self.obs_noise} on observations and "
+                f"noise must be finite and not negative, found {self.obs_noise} on observations and "
                 f"{self.action_noise} on actions"
             )
         if self.env.spec.discrete and self.action_noise > 1:

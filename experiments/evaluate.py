@@ -125,8 +125,6 @@ def main(config: EvaluateConfig) -> None:
         raise UsageError(
             "no result folder given; usage: python -m experiments.evaluate RUN_DIR ..."
         )
-    if min(*config.obs_noise, *config.action_noise, 0.0, 0.0) < 0:
-        raise UsageError("--obs-noise and --action-noise must not be negative")
     if config.json:
         if not config.json.parent.is_dir():
             raise UsageError(f"no folder {config.json.parent} to write {config.json.name} to")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import signal
 import sys
 import time
@@ -219,8 +220,10 @@ def main(config: PretrainConfig) -> None:
     positive(config.data, "episodes")
     positive(config.train, "steps", "batch_size", "part_size", "part_steps", "bucket")
     positive(config, "max_prompt_length", "eval_tasks", "eval_every", "save_every", "holdout")
-    if config.train.obs_noise < 0:
-        raise UsageError(f"--obs-noise must not be negative, found {config.train.obs_noise}")
+    if not 0 <= config.train.obs_noise < math.inf:
+        raise UsageError(
+            f"--obs-noise must be finite and not negative, found {config.train.obs_noise}"
+        )
     if config.train.batch_size % config.train.part_size:
         raise UsageError(
             f"--batch-size {config.train.batch_size} is not a multiple of --part-size "

@@ -76,7 +76,10 @@ class Gaussian(NamedTuple):
 
 
 class Mixture(NamedTuple):
-    """Mixture of M diagonal Gaussians; its mode is taken to be the mean of the likeliest component."""
+    """Mixture of M diagonal Gaussians; its mode is taken to be the mean of the likeliest component.
+
+    Not from the paper, which has one Gaussian.
+    """
 
     logits: Float[Array, "*batch M"]
     mean: Float[Array, "*batch M A"]
@@ -111,14 +114,15 @@ class Mixture(NamedTuple):
 class Binned(NamedTuple):
     """Every dimension of an action for itself, on N evenly spaced values from -1 to 1.
 
-    An action counts as the nearest value; samples are spread evenly around theirs and clipped.
+    An action counts as the nearest value; samples are spread evenly around theirs and clipped. Not from
+    the paper, which has a Gaussian.
     """
 
     logits: Float[Array, "*batch A N"]
 
     def log_prob(self, action: Float[Array, "*batch A"]) -> Float[Array, "*batch"]:
         intervals = self.logits.shape[-1] - 1
-        nearest = jnp.round((action + 1) / 2 * intervals).astype(jnp.int32)
+        nearest = jnp.round((jnp.clip(action, -1.0, 1.0) + 1) / 2 * intervals).astype(jnp.int32)
         return jnp.sum(Categorical(self.logits).log_prob(nearest) + jnp.log(intervals / 2), axis=-1)
 
     def sample(self, key: PRNGKeyArray) -> Float[Array, "*batch A"]:

@@ -8,6 +8,7 @@ a checkpoint equals one that was never interrupted, bit for bit.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -198,11 +199,12 @@ def make_trainer(
     """Build the training program for a dataset on a mesh.
 
     Raises:
-      ValueError: if the devices do not divide ``config.part_size``, or ``config.obs_noise`` is negative.
+      ValueError: if the devices do not divide ``config.part_size``, or ``config.obs_noise`` is negative
+        or not finite.
     """
     num_devices = mesh.devices.size
-    if config.obs_noise < 0:
-        raise ValueError(f"obs_noise must not be negative, found {config.obs_noise}")
+    if not 0 <= config.obs_noise < math.inf:
+        raise ValueError(f"obs_noise must be finite and not negative, found {config.obs_noise}")
     if config.part_size % num_devices:
         raise ValueError(f"part_size {config.part_size} does not divide over {num_devices} devices")
     home = mesh.devices.flat[0]

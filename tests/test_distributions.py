@@ -137,6 +137,13 @@ def test_binned_integrates_to_one_but_for_half_an_interval_at_each_end():
     assert density.mean() * 2.05 == pytest.approx(1.0, abs=1e-3)
 
 
+def test_binned_counts_actions_beyond_the_ends_as_the_ends():
+    distribution = Binned(jax.random.normal(jax.random.key(0), (1, 41)))
+    for beyond, end in ((1.3, 1.0), (-7.0, -1.0)):
+        found, expected = (distribution.log_prob(jnp.array([value])) for value in (beyond, end))
+        assert found == expected
+
+
 def test_binned_samples_have_its_probabilities():
     logits = jnp.array([[0.3, -1.2, 2.0, 0.0, -0.4]])
     keys = jax.random.split(jax.random.key(3), 5000)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import jax
@@ -96,7 +97,8 @@ def test_noise_on_discrete_actions_replaces_them():
 
 
 def test_refuses_what_is_no_noise():
-    with pytest.raises(ValueError, match="must not be negative, found -1"):
-        Noisy(Echo(), obs_noise=-1.0)
+    for size in (-1.0, math.nan, math.inf):
+        with pytest.raises(ValueError, match=f"finite and not negative, found {size}"):
+            Noisy(Echo(), obs_noise=size)
     with pytest.raises(ValueError, match="a probability, found 2"):
         Noisy(MAZE, action_noise=2.0)
