@@ -1,6 +1,6 @@
 """Settings of the command lines, and the presets of each world.
 
-``fast`` is the recipe that two cores finish in well under an hour; ``paper`` has the paper's values
+``fast`` is the recipe for two cores, in ten minutes to two hours; ``paper`` has the paper's values
 (Table 6, and its code's where the text is silent); ``smoke`` only shows that everything runs.
 """
 
@@ -79,7 +79,8 @@ class PretrainConfig(Common):
     num_heads: int = 4
     """Attention heads [1]."""
     head: str | None = None
-    """Distribution of continuous actions: gaussian, mixture, binned or fixed_gaussian [fixed_gaussian*]."""
+    """Distribution of continuous actions: gaussian, mixture, binned or fixed_gaussian (default: binned in
+    kitchen) [fixed_gaussian in the authors' code]."""
     standardize_obs: bool = False
     """Standardize observations by their mean and spread in the dataset [False]."""
     holdout: int = 200

@@ -150,7 +150,7 @@ def replay(episodes: Episode) -> Iterator[tuple[list[str], list[str], float]]:
 
     In contact the smallest difference grows, so that a replay of actions alone parts after one or two
     subtasks. Yields, for each episode, what it completed here and there, in order, and the largest
-    difference of a position of arm or objects after a step.
+    difference of a position of arm or objects after a step, the last one excepted.
     """
     kitchen = gymnasium_kitchen()
     robot = kitchen.robot_env
@@ -207,7 +207,8 @@ def compare_solvers(episodes: Episode, together: int) -> Iterator[str]:
 
     env = Kitchen("kitchen", 500, "native")
     pairs = demonstrated_states(env, episodes)
-    whole = len(pairs.ctrl) // together * together
+    together = min(together, len(pairs.ctrl))
+    whole = len(pairs.ctrl) // together * together  # a remainder would be another program
     pairs = jax.tree.map(lambda leaf: leaf[:whole].reshape(-1, together, *leaf.shape[1:]), pairs)
     on = jnp.ones((), bool)
     exact = jax.lax.map(

@@ -18,6 +18,7 @@ import pytest
 from conftest import require_kitchen
 from jax.sharding import PartitionSpec
 
+from envs.experts import demonstrators
 from envs.kitchen import (
     NONE,
     SUBTASKS,
@@ -35,6 +36,7 @@ import mujoco  # noqa: E402
 
 HORIZON = 500
 WORLD = Kitchen(name="kitchen", horizon=HORIZON)
+MJX = Kitchen(name="kitchen-mjx", horizon=HORIZON, backend="mjx")
 STOCK = Kitchen(name="stock", horizon=HORIZON, model="stock")
 NUM_TASKS = 325
 BURNER, LIGHT, SLIDE, HINGE, MICROWAVE = range(5)
@@ -61,7 +63,9 @@ def stepper(env):
     return jax.jit(env.step)
 
 
-step_many = jax.jit(jax.vmap(WORLD.step))
+@cache
+def many_stepper(env):
+    return jit_with(env)(jax.vmap(env.step))
 
 
 def begin(order, env=WORLD):
@@ -246,6 +250,12 @@ class TestBadInput:
         with pytest.raises(MissingExtraError, match=rf'{package}: pip install -e "\.\[kitchen\]"'):
             extra.check_extra()
 
+    def test_demonstrators_of_a_world_made_by_hand(self, monkeypatch):
+        versions = {"mujoco": "4.0.0", "mujoco-mjx": "3.17.0"}
+        monkeypatch.setattr(extra, "version", versions.get)
+        with pytest.raises(MissingExtraError, match=r"pip install"):
+            demonstrators(WORLD)
+
     def test_a_wrong_pair(self, monkeypatch):
         versions = {"mujoco": "4.0.0", "mujoco-mjx": "3.17.0"}
         monkeypatch.setattr(extra, "version", versions.get)
@@ -266,23 +276,25 @@ class TestBadInput:
             extra.check_extra()
 
     @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-    def test_an_action_that_is_no_number_ends_its_own_episode(self, bad):
-        states = jax.vmap(lambda _: begin([LIGHT]))(jnp.arange(4))
+    @pytest.mark.parametrize("env", [WORLD, pytest.param(MJX, marks=pytest.mark.slow)])
+    def test_an_action_that_is_no_number_ends_its_own_episode(self, env, bad):
+        step_many = many_stepper(env)
+        states = jax.vmap(lambda _: begin([LIGHT], env))(jnp.arange(4))
         actions = jnp.asarray(random_actions(0, 4)).at[2, 5].set(bad)
         after, steps = step_many(states, actions)
         assert after.failed.tolist() == after.done.tolist() == [False, False, True, False]
         assert steps.truncated.tolist() == [False, False, True, False]
         assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(after.physics))
-        clean, _ = jax.jit(jax.vmap(WORLD.step))(
-            states, jnp.where(jnp.isfinite(actions), actions, 0)
-        )
+        clean, _ = step_many(states, jnp.where(jnp.isfinite(actions), actions, 0))
         for one, other in zip(after.physics, clean.physics, strict=True):
             np.testing.assert_array_equal(one[:2], other[:2])
 
     @pytest.mark.parametrize("speed", [1e5, 1e15, 1e30])
-    def test_a_diverged_world_ends_its_own_episode(self, speed):
+    @pytest.mark.parametrize("env", [WORLD, pytest.param(MJX, marks=pytest.mark.slow)])
+    def test_a_diverged_world_ends_its_own_episode(self, env, speed):
         num = 20  # enough for several threads
-        states = jax.vmap(lambda _: begin([LIGHT]))(jnp.arange(num))
+        step_many = many_stepper(env)
+        states = jax.vmap(lambda _: begin([LIGHT], env))(jnp.arange(num))
         bad = jnp.arange(num) % 7 == 1
         qvel = jnp.where(bad[:, None], speed, states.physics.qvel)
         broken = states._replace(physics=states.physics._replace(qvel=qvel))
@@ -292,8 +304,8 @@ class TestBadInput:
         np.testing.assert_array_equal(steps.failed, bad)
         assert (steps.reward == 0).all()
         assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(after.physics))
-        alone, _ = stepper(WORLD)(begin([LIGHT]), jnp.zeros(9))
-        np.testing.assert_array_equal(after.physics.qpos[0], alone.physics.qpos)
+        whole, _ = step_many(states, jnp.zeros((num, 9)))
+        np.testing.assert_array_equal(after.physics.qpos[~bad], whole.physics.qpos[~bad])
         assert not Path("MUJOCO_LOG.TXT").exists()
 
 
@@ -430,7 +442,7 @@ def test_one_step_of_mjx_is_one_of_native():
         jit_with(env)(
             jax.vmap(lambda action, env=env: env.step(begin([LIGHT], env), action)[1].obs)
         )(actions)
-        for env in (WORLD, Kitchen("kitchen", HORIZON, "mjx"))
+        for env in (WORLD, MJX)
     ]
     np.testing.assert_allclose(*after, atol=5e-3)
     assert np.median(np.abs(after[0] - after[1])) < 1e-5

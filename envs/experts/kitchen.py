@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from envs.base import Agent, Demonstrator, TimeStep
+from envs.kitchen.extra import import_mujoco
 from envs.kitchen.physics import CONTROL_PERIOD
 from envs.kitchen.world import (
     MAX_SHIFT,
@@ -33,10 +34,7 @@ from envs.kitchen.world import (
 NOISE = 0.08  # standard deviation on the actions of arm and fingers
 OPEN, CLOSED = 0.04, 0.0  # m, of each finger
 
-STIFFNESS = np.array([870, 870, 870, 870, 120, 120, 120.0])  # of the position actuators, N m / rad
-# What a step moves a joint is a part of what its target moves.
-REACH = 1 - np.exp(-CONTROL_PERIOD * STIFFNESS / np.array([100, 100, 100, 100, 10, 10, 10.0]))
-# A little inside of the joints' ranges and of the targets' bounds.
+# All poses are angles of the seven joints, rad. A little inside of the ranges and of the targets' bounds:
 LOW = np.array([-2.85, -1.755, -2.85, -3.02, -2.85, 0.02, -2.85])
 HIGH = np.array([2.85, 1.72, 2.85, -0.45, 2.85, 2.09, 2.85])
 HOME = np.array([0.148, -1.768, 1.844, -2.477, 0.26, 0.713, 1.595])  # where tries start again
@@ -62,7 +60,8 @@ class Phase(NamedTuple):
     """One movement of the hand.
 
     The tip follows ``point`` of the object, as its joint plus ``lead`` would carry it (kept within
-    ``joint_range``), plus ``offset`` to the right, forward and up of the hand.
+    ``joint_range``), plus ``offset`` to the right, forward and up of the hand. Lengths are in m, angles in
+    rad; an object's joint is in rad, the slide cabinet's in m.
     """
 
     point: Vector = (0.0, 0.0, 0.0)
@@ -76,10 +75,13 @@ class Phase(NamedTuple):
     pitch: Number = 0.0
     """Downward."""
     grip: Number = CLOSED
+    """Position of each finger."""
     tolerance: Number = 0.0
     """Distance at which the phase ends, m (rad for joint moves); 0 takes all steps."""
     turn_tolerance: Number = 9.0
+    """Angle to the target's orientation at which the phase may end."""
     steps: Number = 20
+    """After which the phase ends at the latest."""
     stop: Number = 9.0
     """Joint position at which the phase ends, counted in the direction of motion."""
     lost: Number = 9.0
@@ -234,8 +236,7 @@ def _single(column: np.ndarray) -> np.ndarray:
 @cache
 def make_scene(model_name: str) -> Scene:
     """Poses of the objects' bodies in either model."""
-    import mujoco
-
+    mujoco = import_mujoco()
     from envs.kitchen.model import load_model
 
     model = load_model(model_name)
@@ -250,10 +251,15 @@ def make_scene(model_name: str) -> Scene:
 
 def scripted_arm(env: Kitchen, noise: float = NOISE) -> Agent:
     """The demonstrator; ``noise`` is the standard deviation on the nine actions."""
+    import_mujoco()  # complains before its first use
     from envs.kitchen.arm import Pose, arm_pose, make_arm, rotation_vector, turn
     from envs.kitchen.model import load_model
 
-    plan, scene, arm = make_plan(), make_scene(env.model), make_arm(load_model(env.model))
+    model = load_model(env.model)
+    plan, scene, arm = make_plan(), make_scene(env.model), make_arm(model)
+    stiffness = model.actuator_gainprm[:7, 0]  # of the position actuators, N m / rad
+    # What a step moves a joint is a part of what its target moves.
+    reach = 1 - np.exp(-CONTROL_PERIOD * stiffness / model.dof_damping[:7])
 
     def hand_target(
         phase: Phase, subtask: Int[Array, ""], joint: Float[Array, ""], lead: Float[Array, ""]
@@ -361,7 +367,7 @@ def scripted_arm(env: Kitchen, noise: float = NOISE) -> Agent:
             0.5 * (current.pose - angles),
             toward(pose, angles, point, rotation, current),
         )
-        wanted = (step / REACH + pose.gravity / STIFFNESS) / MAX_SHIFT
+        wanted = (step / reach + pose.gravity / stiffness) / MAX_SHIFT
         arm_action = wanted / jnp.maximum(1.0, jnp.max(jnp.abs(wanted)))
         fingers = jnp.clip(4 * (current.grip - positions[7:NUM_ROBOT]) / MAX_SHIFT, -1.0, 1.0)
         action = jnp.concatenate([arm_action, fingers])

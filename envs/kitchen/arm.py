@@ -19,7 +19,7 @@ PAD = 0.03  # m, from the site between the fingers to the middle of their pads
 
 
 class Arm(NamedTuple):
-    """Constants of the seven links; all joints turn about the z axis of their link."""
+    """Constants of the seven links, in m and kg; all joints turn about the z axis of their link."""
 
     base_position: Float[np.ndarray, "3"]
     base_rotation: Float[np.ndarray, "3 3"]
@@ -35,7 +35,7 @@ class Arm(NamedTuple):
 
 
 class Pose(NamedTuple):
-    """The arm at some joint angles, in the world's frame."""
+    """The arm at some joint angles, in the world's frame; m and rad."""
 
     tip: Float[Array, "3"]
     rotation: Float[Array, "3 3"]

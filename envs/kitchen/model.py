@@ -7,8 +7,9 @@ objects that the subtasks move. It differs from the stock scene in that
 - the burner and the lamp, which equality constraints tie to their switches, are computed from them;
 - collisions are those of fingers and hand with the handles, the knob, the light switch, three doors and the
   counter, all of them capsules; the rest of the arm passes through the furniture;
-- it takes 10 steps of 0.008 s in a control step, the stock scene 40 of 0.002 s; friction is 2 instead of
-  1 and contacts are stiffer, so that grasps hold at that step.
+- it takes 10 steps of 0.008 s in a control step, the stock scene 40 of 0.002 s; so that grasps hold at that
+  step, sliding friction is 2 instead of 1 and contacts have a higher impedance (``solimp``), but a slower
+  reference (``solref``); fingers have no friction against rolling and spinning (``condim`` 3, there 6).
 
 The scene (kitchen: Copyright 2019 The DSuite Authors; Franka arm: modified from
 github.com/vikashplus/franka; both Apache License 2.0) is read from the installed gymnasium-robotics.
@@ -64,6 +65,7 @@ class Capsule(NamedTuple):
     radius: float
 
 
+# Placed by hand along the shapes that collide in the stock scene.
 FINGERS = (
     Capsule("left finger", "panda0_leftfinger", (0, 0.0112, 0.034), (0, 0.0112, 0.084), 0.0105),
     Capsule("right finger", "panda0_rightfinger", (0, -0.0112, 0.034), (0, -0.0112, 0.084), 0.0105),
@@ -179,7 +181,7 @@ def reduce_model(full: mujoco.MjModel) -> mujoco.MjModel:
             geomname1=first,
             geomname2=second,
             condim=3,
-            friction=[2, 2, 0.005, 0.0001, 0.0001],
+            friction=[2, 2, 0, 0, 0],  # against sliding; condim 3 reads no other
             solref=[0.02, 1],
             solimp=[0.95, 0.99, 0.001, 0.5, 2],
             margin=0.001,
