@@ -6,14 +6,18 @@ On CPUs a program that holds it must be compiled with ``EnvSpec.compiler_options
 from __future__ import annotations
 
 import copy
+import io
+from contextlib import redirect_stdout
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
-from mujoco import mjx
 
 from envs.kitchen.model import SUBSTEPS, initial_state, load_model, scene_coordinates
 from envs.kitchen.physics import Physics, PhysicsState
+
+with redirect_stdout(io.StringIO()):  # it prints that Warp, which is not used here, is missing
+    from mujoco import mjx
 
 # Lanes of a program wait for the slowest, so the solver stops early; it starts from the last solution.
 ITERATIONS, LINE_SEARCH_ITERATIONS = 4, 6
