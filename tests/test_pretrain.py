@@ -261,9 +261,12 @@ def test_noise_is_for_training_only(params):
     assert loss(False, 0.5) != clean
 
 
-def test_noise_must_not_be_negative():
-    with pytest.raises(ValueError, match="obs_noise must not be negative, found -1"):
-        make_trainer(replace(CONFIG, obs_noise=-1.0), NETWORK, DATASET, device_mesh(1))
+@pytest.mark.parametrize("size", [-1.0, float("nan"), float("inf")])
+def test_noise_is_finite_and_not_negative(size):
+    with pytest.raises(
+        ValueError, match=f"obs_noise must be finite and not negative, found {size}"
+    ):
+        make_trainer(replace(CONFIG, obs_noise=size), NETWORK, DATASET, device_mesh(1))
 
 
 def test_devices_must_divide_the_parts():
