@@ -23,6 +23,8 @@ class LoadedPolicy(NamedTuple):
     made: dict[str, Any]
     sha256: str = ""
     """Of the file of weights; none for those that were never on disk."""
+    folder: Path | None = None
+    """Where it was read."""
 
 
 def released_folder(env_name: str) -> Path:
@@ -33,7 +35,7 @@ def released_folder(env_name: str) -> Path:
 def load_network(env: Environment, path: Path | None) -> LoadedPolicy:
     """The network in ``path`` (default: the released one), checked against the world."""
     folder = path or released_folder(env.spec.name)
-    return LoadedPolicy(*load_policy_files(folder, env.spec), hash_file(folder / WEIGHTS))
+    return LoadedPolicy(*load_policy_files(folder, env.spec), hash_file(folder / WEIGHTS), folder)
 
 
 def load_network_of(result: Results, env: Environment) -> LoadedPolicy:
@@ -45,16 +47,16 @@ def load_network_of(result: Results, env: Environment) -> LoadedPolicy:
     path = result.config.get("policy")
     folder = Path(path) if path else released_folder(make_env(result.config["env"]).spec.name)
     network = load_network(env, folder)
-    check_weights(result, network, folder, "adapt again with `python -m experiments.adapt`")
+    check_weights(result, network, "adapt again with `python -m experiments.adapt`")
     return network
 
 
-def check_weights(result: Results, network: LoadedPolicy, folder: Path, mend: str) -> None:
-    """Raise ``DataError`` if an adaptation was made with other weights than those in ``folder``."""
+def check_weights(result: Results, network: LoadedPolicy, mend: str) -> None:
+    """Raise ``DataError``, which ends in ``mend``, if an adaptation was made with other weights."""
     made_with = result.summary.get("policy_sha256", network.sha256)
     if network.sha256 != made_with:
         raise DataError(
-            f"the weights in {folder} ({network.sha256[:12]}) are not those that the prompts of "
+            f"the weights in {network.folder} ({network.sha256[:12]}) are not those that the prompts of "
             f"{result.config['env']} {result.config['bandit']} were found with ({made_with[:12]}): "
             + mend
         )

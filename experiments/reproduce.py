@@ -22,7 +22,7 @@ from experiments.adapt import AdaptConfig, OptimizerConfig, save_results
 from experiments.adaptation import run_variants
 from experiments.configs import RUNS, DataConfig, make_env, positive, pretrain_preset
 from experiments.figures import learning_curve
-from experiments.policies import check_weights, load_network, released_folder
+from experiments.policies import check_weights, load_network
 from experiments.pretrain import main as pretrain
 from experiments.results import load_results
 from experiments.runtime import Common, run
@@ -164,8 +164,7 @@ def adapted(
     network = load_network(env, policy)
     missing = {folder: variant for folder, variant in folders.items() if not folder.exists()}
     for folder in folders.keys() - missing.keys():
-        place = policy or released_folder(env.spec.name)
-        check_weights(load_results(folder), network, place, f"remove {folder}")
+        check_weights(load_results(folder), network, f"remove {folder}")
     if not missing:
         return
     tasks = benchmark_tasks(env)
