@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
@@ -19,7 +20,7 @@ from experiments.configs import RUNS, make_env, positive
 from experiments.policies import load_network, released_folder
 from experiments.runtime import Common, provenance, refuse_existing, run, write_json
 from experiments.statistics import seed_spread, stratified_bootstrap_iqm
-from experiments.tasks import benchmark_tasks, load_tasks, save_tasks
+from experiments.tasks import benchmark_tasks, evaluation_tasks, load_tasks, save_tasks
 from mgpo_jax.errors import UsageError, nearest
 from mgpo_jax.files import new_folder
 from mgpo_jax.optimizers import OPTIMIZERS
@@ -58,6 +59,8 @@ class AdaptConfig(Common):
     tasks: Path | None = None
     """Your own tasks, an npz file; mazes: maze [N, S, S] with 1 = wall, goal [N, 2] row and column;
     kitchen: order [N, 5], subtasks 0 to 4 and -1 for none (default: the test tasks of the world)."""
+    validation: bool = False
+    """As many tasks that are no test tasks, to choose an optimizer's settings by."""
     seeds: int = 3
     """Independent adaptations to each task [3]."""
     episodes: int = 100
@@ -185,8 +188,12 @@ def save_results(
     return summary
 
 
-def chosen_tasks(env: Environment, path: Path | None) -> Task:
-    """A user's tasks, or the world's test tasks."""
+def chosen_tasks(env: Environment, path: Path | None, validation: bool = False) -> Task:
+    """A user's tasks, the world's test tasks, or as many others."""
+    if validation and path is not None:
+        raise UsageError("--validation draws the tasks; leave out --tasks")
+    if validation:
+        return evaluation_tasks(env, env.spec.num_test_tasks)
     if path is not None:
         return load_tasks(path, env)
     released = released_folder(env.spec.name) / "tasks.npz"
@@ -211,6 +218,11 @@ def main(config: AdaptConfig) -> None:
     """Search a prompt for each task within a budget of episodes."""
     positive(config, "seeds", "episodes", "max_goals", "eval_every", "eval_episodes")
     positive(config.options, "num_edits", "population_size", "latent_dim")
+    for name in ("scale", "min_std", "std_init"):
+        value = getattr(config.options, name)
+        if value is not None and not 0 < value < math.inf:
+            flag = f"--{name.replace('_', '-')}"
+            raise UsageError(f"{flag} must be finite and above 0, found {value}")
     env = make_env(config.env)
     make_optimizer = chosen_optimizer(config)
     network = load_network(env, config.policy)
@@ -220,7 +232,7 @@ def main(config: AdaptConfig) -> None:
             f"--max-goals {config.max_goals} is longer than the policy's prompts ({longest} goals); "
             "pre-train with --max-prompt-length"
         )
-    tasks = chosen_tasks(env, config.tasks)
+    tasks = chosen_tasks(env, config.tasks, config.validation)
     folder = config.folder
     refuse_existing(folder, "remove it", "choose another with --out")
     optimum = np.asarray(jax.jit(jax.vmap(env.optimal_return))(tasks))

@@ -19,6 +19,7 @@ SCALES = {"sphere": np.ones(DIM), "ellipsoid": 10 ** np.linspace(0, 3, DIM)}
 TARGET = 1e-4
 
 NUM_SLOTS, NUM_STEPS, NUM_EPISODES = 3, 5, 31
+STD_INIT = 0.1
 TASK_GOAL = jnp.array([0.9, 0.8])
 BLANK = Trajectory(
     obs=jnp.zeros((NUM_STEPS, 1)),
@@ -124,7 +125,7 @@ def play(key, query):
 
 def search(key):
     space = SearchSpace(NUM_SLOTS, lambda key: jnp.zeros(2), (-10.0, 0.0), NUM_EPISODES)
-    optimizer = bbt(space, POPULATION, 4)
+    optimizer = bbt(space, POPULATION, 4, std_init=STD_INIT)
     key_init, key_run = jax.random.split(key)
 
     def episode(state, key):
@@ -210,4 +211,4 @@ def test_the_best_prompt_is_the_first_of_the_highest_return(logs):
 
 def test_step_size_is_where_the_search_starts(logs):
     _, _, asked, _, _ = logs
-    np.testing.assert_allclose(asked.cma.std[:, 0], 0.1, rtol=1e-6)
+    np.testing.assert_allclose(asked.cma.std[:, 0], STD_INIT, rtol=1e-6)

@@ -23,7 +23,14 @@ from experiments.collect import CollectConfig
 from experiments.configs import PretrainConfig, pretrain_default, pretrain_preset
 from experiments.evaluate import EvaluateConfig
 from experiments.release import ReleaseConfig
-from experiments.tasks import benchmark_tasks, load_tasks, sample_tasks, save_tasks, task_hashes
+from experiments.tasks import (
+    benchmark_tasks,
+    load_tasks,
+    num_tasks,
+    sample_tasks,
+    save_tasks,
+    task_hashes,
+)
 from mgpo_jax.checkpoint import load_policy_files
 from mgpo_jax.dataset import load_dataset
 from mgpo_jax.files import hash_file
@@ -103,6 +110,9 @@ RESULT = Path(__file__).parents[1] / "results/maze15/ucb"
         ("adapt --episodes 0", 2, "--episodes must be at least 1"),
         ("adapt --seeds 0", 2, "--seeds must be at least 1"),
         ("adapt --bandit bpe --c 2", 2, "--c is no option of bpe"),
+        ("adapt --bandit bbt --std-init 0", 2, "--std-init must be finite and above 0"),
+        ("adapt --bandit ucb --scale nan", 2, "--scale must be finite and above 0"),
+        ("adapt --validation --tasks mine.npz", 2, "--validation draws the tasks"),
         ("adapt --policy nowhere", 2, "no policy in nowhere"),
         ("pretrain --env gridwrld", 2, "unknown environment 'gridwrld'"),
         ("pretrain --preset papr", 2, "did you mean 'paper'"),
@@ -260,6 +270,13 @@ def test_adapt_writes_what_it_prints(
     np.testing.assert_allclose(
         np.maximum.accumulate(greedy, axis=-1)[:, :, [0, 1, 3, 4]], raw["eval_returns"], atol=1e-5
     )
+
+    code, text = command(f"{line.replace('result', 'others')} --validation")
+    assert code == 0, text
+    env = envs.make("maze15")
+    others, tests = load_tasks(Path("others/tasks.npz"), env), benchmark_tasks(env)
+    assert num_tasks(others) == num_tasks(tests)
+    assert not np.isin(task_hashes(env, others), task_hashes(env, tests)).any()
 
     code, text = command("evaluate result --episodes 1 --json noise.json")
     assert code == 0, text
