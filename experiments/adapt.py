@@ -43,7 +43,7 @@ class OptimizerConfig:
     latent_dim: int | None = None
     """BBT: dimension of z (default 5)."""
     std_init: float | None = None
-    """BBT: initial step size, in units of goals (default 0.1)."""
+    """BBT: initial step size, in units of goals (default 0.5)."""
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ def bbt(
     space: SearchSpace,
     population_size: int = 10,
     latent_dim: int = 5,
-    std_init: float | Float[Array, ""] = 0.1,
+    std_init: float | Float[Array, ""] = 0.5,
 ) -> PromptOptimizer:
     """Optimize z in p_0 + A z, where p_0 is drawn from the first trajectory.
 
@@ -54,7 +54,8 @@ def bbt(
       space: the search space.
       population_size: lambda [10].
       latent_dim: d, the size of z [not in the paper].
-      std_init: sigma(0), in units of goals: rows of A have unit norm on average [not in the paper].
+      std_init: sigma(0), in units of goals: rows of A have unit norm on average [not in the paper;
+        chosen in ``docs/ablations.md``].
     """
 
     def strategy() -> tuple[Any, Any]:
