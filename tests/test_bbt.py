@@ -19,7 +19,7 @@ SCALES = {"sphere": np.ones(DIM), "ellipsoid": 10 ** np.linspace(0, 3, DIM)}
 TARGET = 1e-4
 
 NUM_SLOTS, NUM_STEPS, NUM_EPISODES = 3, 5, 31
-STD_INIT = 0.1
+STD_INIT = 0.3
 TASK_GOAL = jnp.array([0.9, 0.8])
 BLANK = Trajectory(
     obs=jnp.zeros((NUM_STEPS, 1)),
