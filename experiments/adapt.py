@@ -188,7 +188,7 @@ def save_results(
     return summary
 
 
-def chosen_tasks(env: Environment, path: Path | None, validation: bool = False) -> Task:
+def chosen_tasks(env: Environment, path: Path | None, validation: bool) -> Task:
     """A user's tasks, the world's test tasks, or as many others."""
     if validation and path is not None:
         raise UsageError("--validation draws the tasks; leave out --tasks")
