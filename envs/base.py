@@ -1,54 +1,115 @@
-"""What a world is: a static spec and pure functions over traced tasks and states.
+"""The records of an episode, and what a world has to offer.
 
-Everything is written for one episode; batch, task and seed axes come from ``jax.vmap``.
+A world is a static spec and pure functions over traced tasks and states. Everything is written for one
+episode; ``jax.vmap`` adds the axes of batches, tasks and seeds.
+
+Axes in shapes: T time steps, D components of an observation, G components of a goal, A components of an
+action, N tasks.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
 
-Task = Any  # a pytree of arrays: maze and goal, order of subtasks, world seed ...
+from envs.errors import NotAvailableError
+
+Task = Any  # a pytree of arrays: a maze and a goal, an order of subtasks, the seed of a map ...
 State = Any  # a pytree of arrays
 
 
 @dataclass(frozen=True)
+class ArraySpec:
+    """Shape and dtype of an array without its content."""
+
+    shape: tuple[int, ...]
+    dtype: str = "float32"
+
+    @property
+    def size(self) -> int:
+        return int(np.prod(self.shape, dtype=np.int64))
+
+    @property
+    def is_float(self) -> bool:
+        return np.issubdtype(np.dtype(self.dtype), np.floating)
+
+    def __str__(self) -> str:
+        return f"{self.dtype}{list(self.shape)}"
+
+
+@dataclass(frozen=True)
+class Discrete:
+    """Actions are the integers 0 to ``num`` - 1."""
+
+    num: int
+
+
+@dataclass(frozen=True)
+class Box:
+    """Actions are ``size`` numbers in [-1, 1]."""
+
+    size: int
+
+
+@dataclass(frozen=True, kw_only=True)
 class EnvSpec:
     """Static facts of a world.
 
     Attributes:
-      name: the name ``envs.make`` knows it by.
-      obs_dim: size D of an observation.
+      name: what messages and file names call the world.
+      obs: shape and dtype of an observation.
       goal_dim: size G of a goal.
-      action_dim: number of discrete actions, or size A of a continuous action.
-      discrete: whether actions are integers in ``[0, action_dim)``.
-      horizon: steps after which an episode is truncated.
+      actions: the space of actions.
+      horizon: number of steps after which an episode is truncated.
       return_range: smallest and largest possible return; the optimizers scale by it.
-      truncate_in_hindsight: whether a trajectory cut at any step is a trajectory to another
+      truncate_in_hindsight: whether a trajectory that is cut at any step is a trajectory to another
         task goal (paper, appendix D: true in MazeRunner, where every position is a goal).
-      deterministic: whether task and actions determine an episode; if not, one greedy episode is
-        only a sample of what a prompt is worth.
+      deterministic: whether task and actions determine an episode. If not, the return of one greedy
+        episode is only a sample of what a prompt is worth.
       reward_confirms_goals: whether a reward at a goal says that this goal was the right one at this
-        point, as where a sequence is rewarded part by part.
-      num_test_tasks: tasks kept for test.
-      worlds_together: how many worlds a step should advance at least, where one alone is as dear as some.
-      compiler_options: XLA options, name and value, that programs holding a step should be compiled with.
+        point, as in worlds that reward a sequence part by part.
     """
 
     name: str
-    obs_dim: int
+    obs: ArraySpec
     goal_dim: int
-    action_dim: int
-    discrete: bool
+    actions: Discrete | Box
     horizon: int
     return_range: tuple[float, float]
-    truncate_in_hindsight: bool
-    deterministic: bool
-    reward_confirms_goals: bool
-    num_test_tasks: int = 50
+    truncate_in_hindsight: bool = False
+    deterministic: bool = True
+    reward_confirms_goals: bool = False
+
+    @property
+    def discrete(self) -> bool:
+        return isinstance(self.actions, Discrete)
+
+    @property
+    def action_dim(self) -> int:
+        """The number of discrete actions, or the size A of a continuous one."""
+        return self.actions.num if isinstance(self.actions, Discrete) else self.actions.size
+
+    def zero_action(self) -> Array:
+        """An action of the right shape and dtype."""
+        return jnp.zeros((), jnp.int32) if self.discrete else jnp.zeros(self.action_dim)
+
+
+@dataclass(frozen=True)
+class Engine:
+    """How programs that hold steps of a world want to be run.
+
+    Attributes:
+      worlds_together: how many worlds a step should advance at least, for engines whose calls are
+        expensive however few worlds they step.
+      compiler_options: XLA options, pairs of name and value, to compile such programs with.
+    """
+
     worlds_together: int = 1
     compiler_options: tuple[tuple[str, bool], ...] = ()
 
@@ -56,13 +117,13 @@ class EnvSpec:
 class TimeStep(NamedTuple):
     """What the agent is told after a reset or a step."""
 
-    obs: Float[Array, "D"]
-    goal: Float[Array, "G"]
-    """The goal reached now, f_G(o_t) in section 2.1."""
+    obs: Shaped[Array, "..."]
+    achieved_goal: Float[Array, "G"]
+    """The goal reached now, f_G(o_t) in section 2.1 of the paper."""
     goal_reached: Bool[Array, ""]
-    """Whether ``goal`` counts as reached at this step (mazes: always; subtasks: on completion)."""
+    """Whether ``achieved_goal`` counts as reached at this step (mazes: always; subtasks: on completion)."""
     outcome: Float[Array, "G"]
-    """The task goal this episode would have in hindsight if it ended now."""
+    """The task goal that this episode would have in hindsight if it ended now."""
     reward: Float[Array, ""]
     terminated: Bool[Array, ""]
     truncated: Bool[Array, ""]
@@ -70,50 +131,151 @@ class TimeStep(NamedTuple):
     """Whether the world broke down (diverged physics) and ended the episode because of that."""
 
 
-@runtime_checkable
-class Environment(Protocol):
-    """A world. Frozen and hashable, so that equal worlds share one compiled program."""
+class Goals(NamedTuple):
+    """The goals that an episode reached: all that prompts are drawn from.
+
+    Steps t < length are real, the others padding. Entries at ``t`` describe the world after action ``t``.
+    """
+
+    achieved_goals: Float[Array, "*batch T G"]
+    goal_reached: Bool[Array, "*batch T"]
+    outcomes: Float[Array, "*batch T G"]
+    length: Int[Array, "*batch"]
+
+
+class Trajectory(NamedTuple):
+    """What an episode leaves behind for hindsight: the steps t < length are real, the others padding.
+
+    ``obs[t]`` is what the agent saw before ``actions[t]``. ``achieved_goals[t]``, ``goal_reached[t]``
+    and ``outcomes[t]`` describe the world after it.
+    """
+
+    obs: Shaped[Array, "..."]
+    """``[*batch, T, ...]``, in the dtype of the world."""
+    actions: Array
+    """``[*batch, T]`` integers, or ``[*batch, T, A]`` floats."""
+    achieved_goals: Float[Array, "*batch T G"]
+    goal_reached: Bool[Array, "*batch T"]
+    outcomes: Float[Array, "*batch T G"]
+    length: Int[Array, "*batch"]
 
     @property
-    def spec(self) -> EnvSpec: ...
+    def goals(self) -> Goals:
+        """The trajectory without its observations and actions."""
+        return Goals(self.achieved_goals, self.goal_reached, self.outcomes, self.length)
 
-    def __hash__(self) -> int: ...
+
+class Episode(NamedTuple):
+    """One finished episode."""
+
+    trajectory: Trajectory
+    rewards: Float[Array, "*batch T"]
+    return_: Float[Array, "*batch"]
+    """Undiscounted sum of the rewards."""
+    last_obs: Shaped[Array, "..."]
+    """The observation after the last action."""
+    failed: Bool[Array, "*batch"] | bool = False
+    """Whether the world broke down and ended the episode."""
+    decisions: Any = ()
+    """What the agent decided beside its actions (``Agent.decisions``)."""
+
+
+@dataclass(frozen=True)
+class Environment:
+    """A world, to derive from. Frozen and hashable, so that equal worlds share one compiled program.
+
+    A world defines ``spec``, ``sample_task``, ``task_goal``, ``reset`` and ``step``. Everything else has
+    a default, which may be replaced by something better.
+    """
+
+    @property
+    def spec(self) -> EnvSpec:
+        raise NotImplementedError
 
     def sample_task(self, key: PRNGKeyArray) -> Task:
         """A random task, as a pytree of arrays."""
-        ...
-
-    def sample_goal(self, key: PRNGKeyArray) -> Float[Array, "G"]:
-        """A random goal that can stand in a prompt, without knowledge of the task."""
-        ...
+        raise NotImplementedError
 
     def task_goal(self, task: Task) -> Float[Array, "G"]:
         """The goal g^M that a task reveals to the agent."""
-        ...
+        raise NotImplementedError
 
-    def optimal_return(self, task: Task) -> Float[Array, ""]:
-        """The best return any policy can have on this task."""
-        ...
-
-    def fingerprint(self, task: Task) -> Int[Array, "F"]:
-        """What must differ between the tasks of training and test."""
-        ...
-
-    def check_task(self, task: Task) -> None:
-        """Raise ``ValueError`` with a sentence on what is wrong with a batch of tasks [N, ...]."""
-        ...
-
-    def reset(self, key: PRNGKeyArray, task: Task) -> tuple[State, TimeStep]: ...
+    def reset(self, key: PRNGKeyArray, task: Task) -> tuple[State, TimeStep]:
+        """The start of an episode. All chance in the episode comes from ``key``."""
+        raise NotImplementedError
 
     def step(self, state: State, action: Array) -> tuple[State, TimeStep]:
-        """One step; terminal states absorb with reward 0. There is no auto-reset."""
-        ...
+        """One step. Terminal states absorb with reward 0; there is no auto-reset."""
+        raise NotImplementedError
+
+    @property
+    def engine(self) -> Engine:
+        """How programs that hold steps of this world want to be run (default: in no special way)."""
+        return Engine()
+
+    def optimal_return(self, task: Task) -> Float[Array, ""]:
+        """The best return that any policy can have on this task (default: NaN, which means unknown).
+
+        Where the optimum is unknown, no regret is computed, printed or stored.
+        """
+        del task
+        return jnp.full((), jnp.nan)
+
+    def sample_goal(self, key: PRNGKeyArray) -> Float[Array, "G"]:
+        """A random goal that can stand in a prompt, drawn without knowledge of the task.
+
+        Raises:
+          NotAvailableError: by default. Methods that insert random goals into prompts then cannot be used.
+        """
+        del key
+        raise NotAvailableError(
+            f"{self.spec.name} draws no goals at random (its class does not define sample_goal)"
+        )
+
+    def fingerprint(self, task: Task) -> Int[Array, "F"]:
+        """What must differ between the tasks of training and test (default: all bytes of the task)."""
+        leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves(task)]
+        leaves = [leaf.astype(jnp.uint8) if leaf.dtype == bool else leaf for leaf in leaves]
+        as_bytes = [jax.lax.bitcast_convert_type(leaf, jnp.uint8).ravel() for leaf in leaves]
+        return jnp.concatenate(as_bytes).astype(jnp.int32)
+
+    def check_task(self, tasks: Task) -> None:
+        """Raise ``ValueError`` with a sentence on what is wrong with N stacked tasks.
+
+        The default compares shapes and kinds of numbers with those of ``sample_task``, and refuses
+        numbers that are not finite. A world adds rules of its own, such as that a maze can be solved.
+        """
+        check_shapes(tasks, jax.eval_shape(self.sample_task, jax.random.key(0)))
+
+
+def check_shapes(tasks: Task, example: Task) -> None:
+    """Raise ``ValueError`` for the first array of N stacked tasks that holds no tasks like ``example``."""
+    paths, _ = jax.tree_util.tree_flatten_with_path(example)
+    num: int | None = None  # N, once the first array has told it
+    for (path, like), leaf in zip(paths, jax.tree.leaves(tasks), strict=True):
+        name, array = jax.tree_util.keystr(path, simple=True) or "the task", np.asarray(leaf)
+        stacked = array.ndim == like.ndim + 1 and array.shape[1:] == like.shape
+        if not stacked or len(array) != (len(array) if num is None else num):
+            wanted = ", ".join(map(str, ["N" if num is None else num, *like.shape]))
+            raise ValueError(f"{name} must have shape [{wanted}], found {list(array.shape)}")
+        num = len(array)
+        found, wanted = _kind(array.dtype), _kind(like.dtype)
+        if found != wanted and (found, wanted) != ("integers", "numbers"):
+            raise ValueError(f"{name} must hold {wanted}, found {array.dtype}")
+        if np.issubdtype(array.dtype, np.inexact) and not np.isfinite(array).all():
+            raise ValueError(f"{name} holds NaN or infinity")
+
+
+def _kind(dtype: np.dtype) -> str:
+    """What arrays of this dtype hold, in a word for messages."""
+    kinds = {"b": "booleans", "i": "integers", "u": "integers", "f": "numbers"}
+    return kinds.get(dtype.kind, str(dtype))
 
 
 class Agent(NamedTuple):
     """Whoever acts in an episode: a policy with its prompt, or a demonstrator of a dataset.
 
-    ``begin`` and ``proceed`` return ``(action, quits, memory)``; an agent that quits ends the episode
+    ``begin`` and ``proceed`` return ``(action, quits, memory)``. An agent that quits ends the episode
     before the action.
     """
 
@@ -122,7 +284,10 @@ class Agent(NamedTuple):
     proceed: Callable
     """``(key, memory, state, timestep)`` after every step."""
     grow: Callable = lambda memory, num_steps: memory
-    """Makes room in the memory for that many more steps."""
+    """``(memory, num_steps) -> memory`` with room for that many more steps."""
+    decisions: Callable = lambda memory: ()
+    """``(memory) -> decisions``: what it decided in the episode beside its actions, for agents whose
+    decisions last several steps."""
 
 
 class Demonstrator(NamedTuple):
@@ -130,10 +295,14 @@ class Demonstrator(NamedTuple):
 
     sample_task: Callable
     """``(key, index) -> task`` of the index-th demonstration."""
-    agent: Agent
-    keeps: Callable
-    """``episode -> bool``; other demonstrations are dropped and tried again."""
-    hindsight_return: Callable
-    """``trajectory -> return`` on the task that the trajectory happens to solve."""
+    agent: Callable[[Any], Agent]
+    """``(weights) -> agent``."""
+    keeps: Callable = lambda episode: episode.trajectory.length > 0
+    """``(episode) -> bool``; other demonstrations are dropped and tried again."""
+    hindsight_return: Callable | None = None
+    """``(trajectory) -> return`` on the task that the trajectory happens to solve (default: the return
+    of the episode)."""
+    weights: Any = ()
+    """Arrays that the agent is made from, such as the weights of a network; they enter programs as data."""
     settings: tuple[tuple[str, float], ...] = ()
     """Names and values of what else its data depends on; a dataset made with others is out of date."""

@@ -1,18 +1,124 @@
-"""Franka Kitchen: a robot arm opens doors and turns switches in an order that it is not told."""
+"""Franka Kitchen: a robot arm opens doors and turns switches in an order that it is not told.
+
+Four worlds with the same tasks. ``kitchen`` chooses its physics engine by the machine; ``kitchen-mjx`` and
+``kitchen-native`` name the engine and use the policy and the test tasks of ``kitchen``; ``kitchen-stock``
+is the full scene of gymnasium-robotics. Nothing here imports jax or mujoco.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
 from envs.kitchen.extra import MissingExtraError, NoOpenGLError, check_extra, import_mujoco
-from envs.kitchen.world import NONE, SUBTASKS, Kitchen, KitchenState, KitchenTask
+from envs.registry import World
+
+if TYPE_CHECKING:
+    from envs.base import Demonstrator
+    from envs.drawing import Pictures
+    from envs.kitchen.env import Kitchen
 
 __all__ = [
-    "NONE",
-    "SUBTASKS",
-    "Kitchen",
-    "KitchenState",
-    "KitchenTask",
+    "KITCHEN",
+    "KITCHEN_MJX",
+    "KITCHEN_NATIVE",
+    "KITCHEN_STOCK",
     "MissingExtraError",
     "NoOpenGLError",
     "check_extra",
     "import_mujoco",
 ]
+
+HORIZON = 500
+
+
+def make(name: str = "kitchen", backend: str = "auto", model: str = "reduced") -> Kitchen:
+    """The kitchen with an engine (``auto``, ``native`` or ``mjx``) and a model (``reduced`` or ``stock``).
+
+    Raises:
+      MissingExtraError: if packages are missing or do not fit together.
+      NoOpenGLError: if the OpenGL that ``MUJOCO_GL`` names is missing.
+    """
+    import_mujoco()  # complains now and not in the middle of a program
+    from envs.kitchen.env import Kitchen
+
+    return Kitchen(name=name, horizon=HORIZON, backend=backend, model=model)
+
+
+def make_mjx() -> Kitchen:
+    return make(backend="mjx")
+
+
+def make_native() -> Kitchen:
+    return make(backend="native")
+
+
+def make_stock() -> Kitchen:
+    return make(name="kitchen-stock", backend="native", model="stock")
+
+
+def load_demonstrators(env: Kitchen) -> Mapping[str, Demonstrator]:
+    from envs.kitchen.demonstrators import kitchen_demonstrators
+
+    return kitchen_demonstrators(env)
+
+
+def load_pictures(env: Kitchen) -> Pictures:
+    from envs.kitchen.pictures import kitchen_pictures
+
+    return kitchen_pictures(env)
+
+
+KITCHEN = World(
+    name="kitchen",
+    make=make,
+    summary="a robot arm completes 1 to 5 subtasks in a kitchen in an order that is not told",
+    demonstrators=load_demonstrators,
+    presets={
+        # Trajectories are long, so that 32 of them are enough for a gradient step.
+        "fast": {
+            "steps": 5_000,
+            "episodes": 9_000,
+            "max_prompt_length": 6,
+            "bucket": 32,
+            "batch_size": 32,
+            "part_steps": 2048,
+            "head": "binned",
+            "standardize_obs": True,
+            "obs_noise": 0.03,
+        },
+        "paper": {
+            "steps": 200_000,
+            "episodes": 9_000,
+            "max_prompt_length": 6,
+            "bucket": 32,
+            "head": "fixed_gaussian",
+        },
+    },
+    pictures=load_pictures,
+    num_test_tasks=25,
+)
+
+KITCHEN_MJX = replace(
+    KITCHEN,
+    name="kitchen-mjx",
+    make=make_mjx,
+    summary="the kitchen, always stepped by MuJoCo in JAX (MJX)",
+    policy_of="kitchen",
+)
+
+KITCHEN_NATIVE = replace(
+    KITCHEN,
+    name="kitchen-native",
+    make=make_native,
+    summary="the kitchen, always stepped by MuJoCo in C",
+    policy_of="kitchen",
+)
+
+KITCHEN_STOCK = replace(
+    KITCHEN,
+    name="kitchen-stock",
+    make=make_stock,
+    summary="the kitchen in the full scene of gymnasium-robotics, with all its collisions",
+)

@@ -1,18 +1,22 @@
 """Kinematics of the arm in JAX: where the fingertips are, how joints move them, and what gravity asks for.
 
-Written on the constants of the compiled model, so that it needs no engine state and costs a few small
+It needs only constants of the compiled model and no state of an engine, and costs a few small matrix
 products. The tip is a point between the finger pads; its frame has x along the pads, y along the opening
 of the fingers, z along the approach.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jaxtyping import Array, Float
+
+from envs.kitchen.extra import import_mujoco
+
+if TYPE_CHECKING:
+    import mujoco
 
 GRAVITY = 9.81  # m/s^2
 PAD = 0.03  # m, from the site between the fingers to the middle of their pads
@@ -48,6 +52,7 @@ class Pose(NamedTuple):
 
 def make_arm(model: mujoco.MjModel) -> Arm:
     """The constants of either model."""
+    mujoco = import_mujoco()
     data = mujoco.MjData(model)
     links = [model.body(f"panda0_link{number}") for number in range(1, 8)]
     data.qpos[7:9] = 0.02  # fingers half open
@@ -76,7 +81,7 @@ def make_arm(model: mujoco.MjModel) -> Arm:
         tip_position=site.pos + PAD * tip_rotation[:, 2],
         tip_rotation=tip_rotation,
     )
-    return Arm(*(np.asarray(part, np.float32) for part in arm))
+    return Arm._make(np.asarray(part, np.float32) for part in arm)
 
 
 def arm_pose(arm: Arm, angles: Float[Array, "7"]) -> Pose:
@@ -96,7 +101,7 @@ def arm_pose(arm: Arm, angles: Float[Array, "7"]) -> Pose:
     # Moving joint i lifts all links from i on.
     lift = jnp.cross(axis[:, None], center[None] - anchor[:, None])[..., 2]
     gravity = GRAVITY * jnp.sum(jnp.triu(lift) * arm.masses, axis=1)
-    return Pose(tip, rotation @ arm.tip_rotation, jacobian, gravity)
+    return Pose(tip=tip, rotation=rotation @ arm.tip_rotation, jacobian=jacobian, gravity=gravity)
 
 
 def turn(angle: Float[Array, ""]) -> Float[Array, "3 3"]:
@@ -121,5 +126,5 @@ def rotation_vector(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
 
 def _matrix(quaternion: np.ndarray) -> np.ndarray:
     matrix = np.zeros(9)
-    mujoco.mju_quat2Mat(matrix, quaternion)
+    import_mujoco().mju_quat2Mat(matrix, quaternion)
     return matrix.reshape(3, 3)

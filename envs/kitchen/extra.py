@@ -1,4 +1,4 @@
-"""The optional packages behind the kitchen: found, complete and of matching versions, or a clear error.
+"""The packages behind the kitchen: found, complete and of matching versions, or a clear error.
 
 The scene belongs to gymnasium-robotics, which ships it as files; nothing of it is copied here, and its
 Python code is not imported.
@@ -13,12 +13,12 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import ModuleType
 
-INSTALL = 'pip install -e ".[kitchen]"'
+INSTALL = "pip install -e ."
 SCENE = Path("envs/assets/kitchen_franka/kitchen_assets/kitchen_env_model.xml")
 
 
 class MissingExtraError(ImportError):
-    """Packages of the extra ``kitchen`` are missing or do not fit together."""
+    """Packages that the kitchen needs are missing or do not fit together."""
 
 
 class NoOpenGLError(ImportError):

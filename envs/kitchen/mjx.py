@@ -1,6 +1,6 @@
 """MuJoCo in JAX (MJX): the reduced kitchen as a part of jitted programs, for accelerators.
 
-On CPUs a program that holds it must be compiled with ``EnvSpec.compiler_options``.
+On CPUs, programs that hold it must be compiled with the world's ``engine.compiler_options``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from envs.kitchen.physics import Physics, PhysicsState
 with redirect_stdout(io.StringIO()):  # it prints that Warp, which is not used here, is missing
     from mujoco import mjx
 
-# Lanes of a program wait for the slowest, so the solver stops early; it starts from the last solution.
+# All worlds of a batch wait for the slowest one, so the contact solver stops after few iterations. These
+# are enough because it starts from the solution of the last substep.
 ITERATIONS, LINE_SEARCH_ITERATIONS = 4, 6
 
 
@@ -37,14 +38,18 @@ def mjx_physics(
     def advance(
         state: PhysicsState, ctrl: Float[Array, "9"], active: Bool[Array, ""]
     ) -> PhysicsState:
-        del active  # all lanes of a program take the same time
+        del active  # it would save no time, as a batch computes all its worlds in any case
 
         def substep(state: PhysicsState, _: None) -> tuple[PhysicsState, None]:
             qpos, qvel, warmstart = state
             data = blank.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=ctrl)
             data = mjx.step(model, data)
-            return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), None
+            after = PhysicsState(qpos=data.qpos, qvel=data.qvel, warmstart=data.qacc_warmstart)
+            return after, None
 
         return jax.lax.scan(substep, jax.tree.map(jnp.asarray, state), length=SUBSTEPS[name])[0]
 
-    return Physics(initial_state(name), *scene_coordinates(name), advance)
+    positions, velocities = scene_coordinates(name)
+    return Physics(
+        initial=initial_state(name), positions=positions, velocities=velocities, advance=advance
+    )

@@ -113,7 +113,7 @@ def initial_state(name: str) -> PhysicsState:
     model = load_model(name)
     positions: Any = INITIAL_POSITIONS[joint_addresses(name)[0]].astype(np.float32)
     rest: Any = np.zeros(model.nv, np.float32)
-    return PhysicsState(positions, rest, rest)
+    return PhysicsState(qpos=positions, qvel=rest, warmstart=rest)
 
 
 def scene_coordinates(name: str) -> tuple[Coordinates, Coordinates]:
@@ -269,4 +269,4 @@ def _coordinates(
             source[follower] = source[leader]
             scale[follower] = 1 / full.eq_data[index, 1]
             base[follower] = 0
-    return Coordinates(source, scale, base)
+    return Coordinates(source=source, scale=scale, base=base)

@@ -18,7 +18,7 @@ from mujoco.batch import Batch, SimulationError
 from envs.kitchen.model import SUBSTEPS, initial_state, load_model, scene_coordinates
 from envs.kitchen.physics import Physics, PhysicsState
 
-WORLDS_PER_THREAD = 8  # fewer are not worth waking a thread
+WORLDS_PER_THREAD = 8  # with fewer, waking the thread takes longer than the work it does
 
 
 class Stepper:
@@ -38,7 +38,8 @@ class Stepper:
         that MuJoCo gives up on come back as NaN.
         """
         width = sum(self.sizes)
-        # To numpy first: a jax operation inside of a callback may wait for the program it is in.
+        # Converted to numpy first: a jax operation inside of a callback may wait for the very program that
+        # waits for the callback.
         flat = np.asarray(rows).reshape(-1, rows.shape[-1])
         before = flat[:, :width]
         active = flat[:, -1] > 0
@@ -83,7 +84,8 @@ def native_physics(name: str) -> Physics:
     width = sum(stepper.sizes)
     splits = tuple(np.cumsum(stepper.sizes)[:-1].tolist())
 
-    # On CPU devices a pure_callback would copy rows of 100 KiB on the very threads that wait for it.
+    # For CPU devices: a pure_callback copies large arguments on the threads of the device. These may all be
+    # waiting for the callback, which then never begins. A buffer_callback copies nothing.
     def write(context: Any, out: Any, rows: Any) -> None:
         del context
         np.asarray(out)[...] = stepper(np.asarray(rows))
@@ -97,6 +99,9 @@ def native_physics(name: str) -> Physics:
             after = buffer_callback(write, result, vmap_method="expand_dims")(row)
         else:
             after = jax.pure_callback(stepper, result, row, vmap_method="expand_dims")
-        return PhysicsState(*jnp.split(after, splits))
+        return PhysicsState._make(jnp.split(after, splits))
 
-    return Physics(initial_state(name), *scene_coordinates(name), advance)
+    positions, velocities = scene_coordinates(name)
+    return Physics(
+        initial=initial_state(name), positions=positions, velocities=velocities, advance=advance
+    )

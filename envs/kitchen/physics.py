@@ -1,23 +1,17 @@
 """What a physics engine is to the kitchen: a state of three arrays and one function that advances it.
 
-Two engines implement it on the same models: ``native`` (C MuJoCo, ``envs.kitchen.native``) and ``mjx``
-(JAX, ``envs.kitchen.mjx``). They are imported when first used.
+Two engines implement it on the same models, C MuJoCo and MJX; ``envs.kitchen.engines`` chooses one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from envs.kitchen.extra import import_mujoco
-
-BACKENDS = ("auto", "native", "mjx")
 MODELS = ("reduced", "stock")
 CONTROL_PERIOD = 0.08  # s
 
@@ -37,7 +31,8 @@ class PhysicsState(NamedTuple):
 class Coordinates(NamedTuple):
     """How the coordinates of the full scene follow from those of a model: ``base + scale * q[source]``.
 
-    What a reduced model holds still has scale 0; what follows another joint has its ratio.
+    A coordinate that the reduced model keeps still has scale 0. One that follows another joint has the
+    ratio of the two.
     """
 
     source: Int[np.ndarray, "N"]
@@ -59,29 +54,6 @@ class Physics:
     velocities: Coordinates
     """To the 29 velocities of the full scene."""
     advance: Callable[[PhysicsState, Float[Array, "9"], Bool[Array, ""]], PhysicsState]
-    """``(state, position targets of the actuators, whether it matters) -> state`` after 0.08 s."""
+    """``(state, position targets of the actuators, whether it matters) -> state`` after 0.08 s.
 
-
-def resolve_backend(backend: str, model: str) -> str:
-    """The engine behind ``auto``: MJX on accelerators, C on CPUs and for the stock model."""
-    if backend != "auto":
-        return backend
-    return "native" if model == "stock" or jax.default_backend() == "cpu" else "mjx"
-
-
-@cache
-def load_physics(backend: str, model: str) -> Physics:
-    """The engine ``native`` or ``mjx`` with the model ``reduced`` or ``stock``.
-
-    Raises:
-      MissingExtraError: if the packages of the kitchen are missing or do not fit together.
-      NoOpenGLError: if the OpenGL that ``MUJOCO_GL`` names is missing.
-    """
-    import_mujoco()  # complains before its first use
-    if backend == "native":
-        from envs.kitchen.native import native_physics
-
-        return native_physics(model)
-    from envs.kitchen.mjx import mjx_physics
-
-    return mjx_physics(model)
+    Where the result does not matter, since an episode has ended, an engine may return it unchanged."""

@@ -4,8 +4,8 @@ Paper, section 4.1 and appendix C.2. The scene, its 59 numbers of observation, t
 and what counts as a completed subtask are those of gymnasium-robotics' FrankaKitchen without observation
 noise, as in the authors' code; so is the rule of the reward: 1/n when the next subtask of the task is
 complete and no later one is. Whatever was completed once stays completed, also when its joint moves back,
-so a later subtask that comes too early ends all reward. The task goal names the set of subtasks; a goal
-is the one subtask that was just completed.
+so that a subtask which is completed too early ends all reward. The task goal names the set of subtasks; a
+goal is the one subtask that was just completed.
 
 Observation: 9 positions and 9 velocities of arm and fingers, 21 positions and 20 velocities of the
 objects (rad, m, rad/s, m/s). An action in [-1, 1] moves the targets of the joint actuators to at most
@@ -24,16 +24,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from envs.base import EnvSpec, TimeStep
-from envs.kitchen.physics import (
-    BACKENDS,
-    CONTROL_PERIOD,
-    MODELS,
-    Physics,
-    PhysicsState,
-    load_physics,
-    resolve_backend,
-)
+from envs.base import ArraySpec, Box, Engine, Environment, EnvSpec, TimeStep
+from envs.kitchen.engines import BACKENDS, load_physics, resolve_backend
+from envs.kitchen.physics import CONTROL_PERIOD, MODELS, Physics, PhysicsState
 
 SUBTASKS = ("bottom burner", "light switch", "slide cabinet", "hinge cabinet", "microwave")
 NUM_SUBTASKS = len(SUBTASKS)
@@ -59,7 +52,9 @@ TARGET_LOW = (-2.9, -1.8, -2.9, -3.1, -2.9, 0.0, -2.9, 0.0, 0.0)
 TARGET_HIGH = (2.9, 1.8, 2.9, 0.0, 2.9, 3.8, 2.9, 0.04, 0.04)
 # The fusion emitters of XLA's CPU backend make MJX's batched graph hundreds of times slower.
 MJX_ON_CPU = (("xla_cpu_use_fusion_emitters", False),)
-WORLDS_TOGETHER = 8  # a call into C MuJoCo costs as much as stepping some; MJX works in vectors
+# Smallest efficient batch: below it the overhead of a call into C MuJoCo dominates, and MJX, which computes
+# in vectors, does not fill them.
+WORLDS_TOGETHER = 8
 MAX_SPEED = 1e3  # of any joint; physics beyond has diverged
 
 
@@ -88,11 +83,11 @@ class KitchenState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Kitchen:
+class Kitchen(Environment):
     """The kitchen world.
 
     Attributes:
-      name: the name ``envs.make`` knows it by.
+      name: what messages and file names call it.
       horizon: steps after which an episode is truncated (paper: 500).
       backend: ``native`` (C MuJoCo on threads), ``mjx`` (JAX), or ``auto``: MJX on accelerators.
       model: ``reduced``, or ``stock`` for the scene of gymnasium-robotics as it is (native only).
@@ -120,22 +115,20 @@ class Kitchen:
     def spec(self) -> EnvSpec:
         return EnvSpec(
             name=self.name,
-            obs_dim=OBS_DIM,
+            obs=ArraySpec((OBS_DIM,)),
             goal_dim=NUM_SUBTASKS,
-            action_dim=NUM_ROBOT,
-            discrete=False,
+            actions=Box(NUM_ROBOT),
             horizon=self.horizon,
             return_range=(0.0, 1.0),
-            truncate_in_hindsight=False,
-            deterministic=True,
             reward_confirms_goals=True,
-            num_test_tasks=25,
-            worlds_together=WORLDS_TOGETHER,
-            compiler_options=MJX_ON_CPU if self._is_mjx_on_cpu() else (),
         )
 
-    def _is_mjx_on_cpu(self) -> bool:
-        return self.backend == "mjx" and jax.default_backend() == "cpu"
+    @property
+    def engine(self) -> Engine:
+        mjx_on_cpu = self.backend == "mjx" and jax.default_backend() == "cpu"
+        return Engine(
+            worlds_together=WORLDS_TOGETHER, compiler_options=MJX_ON_CPU if mjx_on_cpu else ()
+        )
 
     @property
     def physics(self) -> Physics:
@@ -151,7 +144,7 @@ class Kitchen:
 
     def task(self, index: Int[Array, ""]) -> KitchenTask:
         """The tasks in a fixed order, over and over again: shorter ones first."""
-        return KitchenTask(jnp.asarray(_all_orders())[index % self.num_tasks])
+        return KitchenTask(order=jnp.asarray(_all_orders())[index % self.num_tasks])
 
     def sample_goal(self, key: PRNGKeyArray) -> Float[Array, "G"]:
         return jax.nn.one_hot(jax.random.randint(key, (), 0, NUM_SUBTASKS), NUM_SUBTASKS)
@@ -169,15 +162,14 @@ class Kitchen:
         """The order: a test order must not occur in training."""
         return task.order
 
-    def check_task(self, task: KitchenTask) -> None:
-        order = np.asarray(task.order)
+    def check_task(self, tasks: KitchenTask) -> None:
+        order = np.asarray(tasks.order)
         if order.ndim != 2 or order.shape[1] != NUM_SUBTASKS:
             raise ValueError(
                 f"order must have shape [N, {NUM_SUBTASKS}] (filled up with {NONE}), "
                 f"found {list(order.shape)}"
             )
-        if not np.issubdtype(order.dtype, np.integer):
-            raise ValueError(f"order must hold integers, found {order.dtype}")
+        super().check_task(tasks)
         if order.min() < NONE or order.max() >= NUM_SUBTASKS:
             raise ValueError(
                 f"order must hold subtasks 0..{NUM_SUBTASKS - 1}, or {NONE} at the end"
@@ -194,11 +186,19 @@ class Kitchen:
     def reset(self, key: PRNGKeyArray, task: KitchenTask) -> tuple[KitchenState, TimeStep]:
         """The arm in front of the closed kitchen, always at the same place."""
         del key
-        nothing = jnp.zeros(NUM_SUBTASKS, bool)
-        zero, running = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
-        physics = jax.tree.map(jnp.asarray, self.physics.initial)
-        state = KitchenState(task, physics, nothing, nothing, zero, zero, running, running)
-        return state, self._observe(state, jnp.zeros(()), running)
+        none, zero = jnp.zeros(NUM_SUBTASKS, bool), jnp.zeros((), jnp.int32)
+        no = jnp.zeros((), bool)
+        state = KitchenState(
+            task=task,
+            physics=jax.tree.map(jnp.asarray, self.physics.initial),
+            completed=none,
+            newly=none,
+            num_solved=zero,
+            steps=zero,
+            failed=no,
+            done=no,
+        )
+        return state, self._observe(state, reward=jnp.zeros(()), complete=no)
 
     def step(self, state: KitchenState, action: Float[Array, "9"]) -> tuple[KitchenState, TimeStep]:
         valid = jnp.all(jnp.isfinite(action))
@@ -210,13 +210,14 @@ class Kitchen:
         order, num_solved = state.task.order, state.num_solved
         num_subtasks = jnp.sum(order != NONE)
         place = jnp.arange(NUM_SUBTASKS)
-        # One subtask a step, so that goals are single ones: of two that arrive together the task's
-        # next one counts now and the other a step later.
+        # At most one subtask is completed in a step, so that every goal names a single one. Of two that
+        # arrive together, the next one of the task counts now and the other one step later.
         arrived = self._at_target(physics) & ~state.completed & ~failed
         expected = place == order[jnp.minimum(num_solved, NUM_SUBTASKS - 1)]
         newly = arrived & (place == jnp.argmax(arrived * (1 + expected)))
         completed = state.completed | newly
-        # Complete: those solved and the next one; not complete: all later ones of the task.
+        # The reward is due when the solved subtasks and the next one are complete and, of the task's
+        # subtasks, no later one is.
         in_order = jnp.all((completed[order] == (place <= num_solved)) | (place >= num_subtasks))
         num_solved += in_order
         steps = state.steps + 1
@@ -257,7 +258,7 @@ class Kitchen:
             obs=jnp.concatenate(
                 [positions[robot], velocities[robot], positions[objects], velocities[objects]]
             ),
-            goal=state.newly.astype(jnp.float32),
+            achieved_goal=state.newly.astype(jnp.float32),
             goal_reached=jnp.any(state.newly),
             outcome=state.completed.astype(jnp.float32),
             reward=reward,

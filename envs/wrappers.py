@@ -1,4 +1,4 @@
-"""Any world with noise on what the agent sees or does (paper, Table 3)."""
+"""Worlds around other worlds."""
 
 from __future__ import annotations
 
@@ -8,10 +8,48 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from envs.base import EnvSpec, State, Task, TimeStep
-from envs.wrapper import Wrapper
+from envs.base import Engine, Environment, EnvSpec, State, Task, TimeStep
+
+
+@dataclass(frozen=True)
+class Wrapper(Environment):
+    """Passes everything on to ``env``; subclasses change what they are about."""
+
+    env: Environment
+
+    @property
+    def spec(self) -> EnvSpec:
+        return self.env.spec
+
+    @property
+    def engine(self) -> Engine:
+        return self.env.engine
+
+    def sample_task(self, key: PRNGKeyArray) -> Task:
+        return self.env.sample_task(key)
+
+    def sample_goal(self, key: PRNGKeyArray) -> Float[Array, "G"]:
+        return self.env.sample_goal(key)
+
+    def task_goal(self, task: Task) -> Float[Array, "G"]:
+        return self.env.task_goal(task)
+
+    def optimal_return(self, task: Task) -> Float[Array, ""]:
+        return self.env.optimal_return(task)
+
+    def fingerprint(self, task: Task) -> Int[Array, "F"]:
+        return self.env.fingerprint(task)
+
+    def check_task(self, tasks: Task) -> None:
+        self.env.check_task(tasks)
+
+    def reset(self, key: PRNGKeyArray, task: Task) -> tuple[State, TimeStep]:
+        return self.env.reset(key, task)
+
+    def step(self, state: State, action: Array) -> tuple[State, TimeStep]:
+        return self.env.step(state, action)
 
 
 class NoisyState(NamedTuple):
@@ -23,12 +61,12 @@ class NoisyState(NamedTuple):
 
 @dataclass(frozen=True)
 class Noisy(Wrapper):
-    """A world behind Gaussian noise.
+    """A world behind Gaussian noise on what the agent sees or does (paper, Table 3).
 
     Attributes:
-      obs_noise: standard deviation on every component of an observation, in its units.
-      action_noise: standard deviation on continuous actions, which are clipped to [-1, 1] again; a
-        discrete action is replaced by a random one with this probability.
+      obs_noise: standard deviation of the noise on every component of an observation, in its units.
+      action_noise: standard deviation of the noise on continuous actions, which are clipped to [-1, 1]
+        again; a discrete action is replaced by a random one with this probability.
     """
 
     obs_noise: float = 0.0
@@ -43,6 +81,11 @@ class Noisy(Wrapper):
         if self.env.spec.discrete and self.action_noise > 1:
             raise ValueError(
                 f"noise on discrete actions is a probability, found {self.action_noise}"
+            )
+        if self.obs_noise and not self.env.spec.obs.is_float:
+            raise ValueError(
+                f"noise on observations needs floating-point observations, those of "
+                f"{self.env.spec.name} are {self.env.spec.obs}"
             )
 
     @property
@@ -68,5 +111,7 @@ class Noisy(Wrapper):
         return jnp.where(jax.random.bernoulli(key_whether, self.action_noise), other, action)
 
     def _blur(self, key: PRNGKeyArray, timestep: TimeStep) -> TimeStep:
+        if not self.env.spec.obs.is_float:
+            return timestep
         noise = self.obs_noise * jax.random.normal(key, timestep.obs.shape)
         return timestep._replace(obs=timestep.obs + noise)

@@ -6,14 +6,22 @@ it chooses the axis at random, as the authors' expert does.
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from envs.base import Agent, Demonstrator, TimeStep
-from envs.grid_world import EAST, FLIP, NORTH, OBJECTS, SOUTH, WEST, GridState, GridTask, GridWorld
+from envs.base import Agent, Demonstrator, TimeStep, Trajectory
+from envs.gridworld.env import (
+    EAST,
+    FLIP,
+    NORTH,
+    OBJECTS,
+    SOUTH,
+    WEST,
+    GridState,
+    GridTask,
+    GridWorld,
+)
 
 
 def switcher() -> Agent:
@@ -38,21 +46,25 @@ def switcher() -> Agent:
         action = jnp.where((down == 0) & (right == 0), FLIP, move)
         return action, jnp.zeros((), bool), memory
 
-    return Agent(begin, proceed)
+    return Agent(begin=begin, proceed=proceed)
 
 
 def grid_demonstrators(env: GridWorld) -> dict[str, Demonstrator]:
     """The dataset of the paper: every ordered task in turn."""
 
-    def hindsight_return(trajectory: Any) -> Array:
-        """1: it switches on what the task names, in its order."""
-        del trajectory
-        return jnp.ones(())
+    def task_in_turn(key: PRNGKeyArray, index: Int[Array, ""]) -> GridTask:
+        del key
+        return env.task(index)
 
     expert = Demonstrator(
-        sample_task=lambda key, index: env.task(index),
-        agent=switcher(),
-        keeps=lambda episode: episode.trajectory.length > 0,
-        hindsight_return=hindsight_return,
+        sample_task=task_in_turn,
+        agent=lambda weights: switcher(),
+        hindsight_return=perfect_return,
     )
     return {"expert": expert}
+
+
+def perfect_return(trajectory: Trajectory) -> Float[Array, ""]:
+    """1: whatever was switched on in an episode is a task that the episode solves."""
+    del trajectory
+    return jnp.ones(())

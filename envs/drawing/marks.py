@@ -13,7 +13,7 @@ from matplotlib.patches import Circle, FancyBboxPatch, Patch, PathPatch
 from matplotlib.textpath import TextPath
 from matplotlib.transforms import Affine2D
 
-from envs.render.palette import INK, PAPER, ink_on
+from envs.drawing.palette import INK, PAPER, ink_on
 
 RADIUS = 0.6  # of a mark of size 1
 FONT = FontProperties(family="DejaVu Sans", weight="bold")

@@ -6,7 +6,8 @@ and proportion at every figure size.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -14,11 +15,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, PowerNorm, to_rgb
-from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
-from envs.render.marks import draw_box, draw_disc, draw_leader, spread_apart
-from envs.render.palette import (
+from envs.base import Episode, Task
+from envs.drawing.marks import draw_box, draw_disc, draw_leader, spread_apart
+from envs.drawing.palette import (
     BAR_COLOR,
     BLUE,
     FREE_COLOR,
@@ -27,7 +28,9 @@ from envs.render.palette import (
     WALL_COLOR,
     YELLOW,
 )
-from envs.render.video import write_gif
+from envs.drawing.pictures import Pictures, Shown
+from envs.drawing.video import axes_in_a_row, write_gif
+from envs.maze.env import MazeRunner
 
 Cell = tuple[int, int] | np.ndarray  # row, column
 
@@ -43,6 +46,55 @@ BAR_GAP = 0.6  # cells between the maze and the bar of goals outside of it
 BAR_LANE, BAR_ROW = 1.7, 1.35  # size of a marker's place in that bar, in marker units
 
 
+def maze_pictures(env: MazeRunner) -> Pictures:
+    """Prompts on mazes, visits under prompts, and a GIF of one task."""
+    start = env.start
+    return Pictures(
+        prompts=partial(draw_prompts, start),
+        visits=partial(draw_visits, start),
+        video=partial(write_video, start),
+        panel=(1.9, 2.1),
+    )
+
+
+def draw_prompts(
+    start: Cell,
+    axes: Sequence[Axes],
+    tasks: Sequence[Task],
+    prompts: Sequence[Mapping[str, np.ndarray]],
+) -> None:
+    """The prompts of several methods on each maze, in the color of their method."""
+    lanes = max(bar_lanes(len(tasks[0].maze), by_color.values()) for by_color in prompts)
+    for ax, task, by_color in zip(axes, tasks, prompts, strict=True):
+        draw_maze(ax, task.maze, start, task.goal, by_color, lanes=lanes)
+
+
+def draw_visits(
+    start: Cell, axes: Sequence[Axes], tasks: Sequence[Task], shown: Sequence[Shown]
+) -> ScalarMappable:
+    """Each prompt on its maze, with the mean visits of the cells in its episodes."""
+    visits = [
+        visit_counts(each.episode, task.maze, start)
+        for task, each in zip(tasks, shown, strict=True)
+    ]
+    norm = visit_norm(*visits)
+    lanes = max(bar_lanes(len(tasks[0].maze), [each.goals]) for each in shown)
+    for ax, task, each, counts in zip(axes, tasks, shown, visits, strict=True):
+        draw_maze(
+            ax, task.maze, start, task.goal, each.goals, visits=counts, norm=norm, lanes=lanes
+        )
+    return visit_scale(norm)
+
+
+def write_video(start: Cell, path: Path, task: Task, shown: Sequence[Shown]) -> None:
+    """Episodes on one maze side by side."""
+    panels = [
+        Panel(title, walk_of(episode, len(task.maze), start), goals)
+        for title, goals, episode in shown
+    ]
+    maze_gif(path, task.maze, start, task.goal, panels)
+
+
 class Placement(NamedTuple):
     """Where the goals of one prompt lie."""
 
@@ -52,6 +104,16 @@ class Placement(NamedTuple):
     """``[k]`` booleans: the goal lies in no cell of the maze."""
 
 
+class Panel(NamedTuple):
+    """One episode of a GIF."""
+
+    title: str
+    walk: np.ndarray
+    """``[T + 1, 2]`` cells, the start first."""
+    prompt_goals: np.ndarray | None = None
+    """``[k, 2]`` in goal units."""
+
+
 class _Marker(NamedTuple):
     """A labeled shape at a cell, or (``cell=None``) in the bar."""
 
@@ -59,6 +121,23 @@ class _Marker(NamedTuple):
     color: str
     shape: Literal["disc", "box"]
     cell: tuple[int, int] | None
+
+
+def walk_of(episode: Episode, side: int, start: Cell) -> np.ndarray:
+    """The cells of one episode, ``[length + 1, 2]``: the start, then where each step led."""
+    goals = np.asarray(episode.trajectory.achieved_goals)[: int(episode.trajectory.length)]
+    return np.concatenate([np.reshape(start, (1, 2)), np.rint(goals * side).astype(int)])
+
+
+def visit_counts(episodes: Episode, maze: np.ndarray, start: Cell) -> np.ndarray:
+    """Mean visits of each cell in one of a batch of episodes, the start included."""
+    goals, lengths = episodes.trajectory.achieved_goals, episodes.trajectory.length
+    cells = np.rint(np.asarray(goals) * len(maze)).astype(int)
+    happened = np.arange(cells.shape[1]) < np.asarray(lengths)[:, None]
+    counts = np.zeros(maze.shape)
+    np.add.at(counts, tuple(cells[happened].T), 1.0)
+    counts[tuple(start)] += len(cells)
+    return counts / len(cells)
 
 
 def place_goals(goals: np.ndarray, side: int) -> Placement:
@@ -135,31 +214,30 @@ def draw_maze(
 
 
 def maze_gif(
-    path: Path,
-    maze: np.ndarray,
-    start: Cell,
-    goal: Cell,
-    positions: np.ndarray,
-    prompt_goals: np.ndarray | Mapping[str, np.ndarray] | None = None,
+    path: Path, maze: np.ndarray, start: Cell, goal: Cell, panels: Sequence[Panel]
 ) -> None:
-    """Write a short GIF of one episode, with the cells ``positions [T, 2]`` after each step."""
-    walk = np.concatenate([np.reshape(start, (1, 2)), np.reshape(positions, (-1, 2))])
+    """Write a short GIF of episodes in one maze; those that end earlier stand still."""
     side = len(maze)
-    prompts = _by_color(prompt_goals)
-    width = picture_width(side, bar_lanes(side, prompts.values())) / side
-    figure = Figure(figsize=(3.0 * width, 3.0), dpi=100)
-    ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    draw_maze(ax, maze, start, goal, prompts)
-    (trail,) = ax.plot([], [], color=AGENT_COLOR, alpha=0.6, linewidth=2.5, zorder=1.5)
-    agent = Circle((0, 0), 0.36 * _unit(side), facecolor=AGENT_COLOR, edgecolor="white", zorder=9)
-    ax.add_patch(agent)
+    prompts = [panel.prompt_goals for panel in panels if panel.prompt_goals is not None]
+    lanes = max((bar_lanes(side, [goals]) for goals in prompts), default=0)
+    width = picture_width(side, lanes) / side
+    figure, axes = axes_in_a_row([panel.title for panel in panels], 3.0 * width, 3.0)
+    moving = []
+    for ax, panel in zip(axes, panels, strict=True):
+        draw_maze(ax, maze, start, goal, panel.prompt_goals, lanes=lanes)
+        (trail,) = ax.plot([], [], color=AGENT_COLOR, alpha=0.6, linewidth=2.5, zorder=1.5)
+        agent = Circle((0, 0), 0.36 * _unit(side), facecolor=AGENT_COLOR, edgecolor="white")
+        agent.set(zorder=9)
+        ax.add_patch(agent)
+        moving.append((panel.walk, trail, agent))
 
     def show(time: int) -> None:
-        rows, columns = walk[: time + 1].T
-        trail.set_data(columns, rows)
-        agent.center = (columns[-1], rows[-1])
+        for walk, trail, agent in moving:
+            rows, columns = walk[: time + 1].T
+            trail.set_data(columns, rows)
+            agent.center = (columns[-1], rows[-1])
 
-    write_gif(path, figure, show, len(walk))
+    write_gif(path, figure, show, max(len(panel.walk) for panel in panels))
 
 
 def _by_color(prompts: np.ndarray | Mapping[str, np.ndarray] | None) -> Mapping[str, np.ndarray]:

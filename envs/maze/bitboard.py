@@ -1,20 +1,20 @@
 """Shortest paths on grids, many cells to a machine word.
 
-A set of cells is a board of ``S`` rows, each row the bits of one ``uint32`` (so sides up to 32). One
-step of a breadth-first search is a handful of shifts on the whole board, which makes it cheap enough to
-plan anew at every step of thousands of mazes at once.
+A set of cells is a board of ``S`` rows, each row the bits of one ``uint32``, so that a side has at most 32
+cells. One step of a breadth-first search takes a few shifts of the whole board. This makes it cheap enough
+to plan anew at every step in thousands of mazes at once.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, UInt32
 
 MAX_SIDE = 32
-# Steps of a search between two looks at whether it has ended; a power of two.
+# A search checks whether it has ended only after every ROUND steps, a power of two.
 ROUND_BITS = 3
 ROUND = 1 << ROUND_BITS
 
@@ -33,7 +33,7 @@ def unpack(board: UInt32[Array, "S"]) -> Bool[Array, "S S"]:
 
 
 def single(cell: Int[Array, "2"], side: int) -> UInt32[Array, "S"]:
-    """The board of one cell (row, column)."""
+    """The board that holds one cell (row, column)."""
     bit = jnp.uint32(1) << cell[1].astype(jnp.uint32)
     return jnp.where(jnp.arange(side) == cell[0], bit, 0).astype(jnp.uint32)
 
@@ -46,6 +46,22 @@ def spread(board: UInt32[Array, "S"]) -> UInt32[Array, "S"]:
     return board | (board << 1) | (board >> 1) | up | down
 
 
+class _Distances(NamedTuple):
+    """A search for the distances of all cells.
+
+    A cell that was found in step s (counted from 0) is in the boards of those bits that s has in binary.
+    """
+
+    reached: UInt32[Array, "S"]
+    grows: Bool[Array, ""]
+    """Whether the last round found new cells."""
+    low: tuple[UInt32[Array, "S"], ...]
+    """Boards of the low bits, which number the steps within a round."""
+    high: UInt32[Array, "H S"]
+    """Boards of the high bits, which number the rounds."""
+    round: Int[Array, ""]
+
+
 def distances(free: Bool[Array, "S S"], source: Int[Array, "2"]) -> Int[Array, "S S"]:
     """Steps of the shortest free path from ``source`` to every cell, -1 where there is none.
 
@@ -56,32 +72,43 @@ def distances(free: Bool[Array, "S S"], source: Int[Array, "2"]) -> Int[Array, "
     open_ = pack(free) | origin
     high_bits = jnp.arange((side * side).bit_length() - ROUND_BITS)
 
-    # A cell found by step s (counted from 0) gets s in binary: one board for each bit. The low bits
-    # are known at compile time within an unrolled round, the high ones are the same for all of it.
-    def search(carry: Any) -> Any:
-        reached, _, low, high, round_ = carry
-        before = reached
-        low = list(low)
-        for step in range(ROUND):
+    def one_round(search: _Distances) -> _Distances:
+        reached, low = search.reached, list(search.low)
+        for step in range(ROUND):  # unrolled: the low bits of a step are known to the compiler
             grown = spread(reached) & open_
             new = grown & ~reached
             low = [bits | new if step >> b & 1 else bits for b, bits in enumerate(low)]
             reached = grown
-        in_round = jnp.where((round_ >> high_bits & 1)[:, None] == 1, reached & ~before, 0)
-        return reached, jnp.any(new), tuple(low), high | in_round.astype(jnp.uint32), round_ + 1
+        is_set = (search.round >> high_bits & 1)[:, None] == 1
+        in_round = jnp.where(is_set, reached & ~search.reached, 0)
+        return _Distances(
+            reached=reached,
+            grows=jnp.any(new),
+            low=tuple(low),
+            high=search.high | in_round.astype(jnp.uint32),
+            round=search.round + 1,
+        )
 
-    none = jnp.zeros(side, jnp.uint32)
-    start = (
-        origin,
-        jnp.ones((), bool),
-        (none,) * ROUND_BITS,
-        jnp.zeros((high_bits.size, side), jnp.uint32),
-        jnp.zeros((), jnp.int32),
+    start = _Distances(
+        reached=origin,
+        grows=jnp.ones((), bool),
+        low=(jnp.zeros(side, jnp.uint32),) * ROUND_BITS,
+        high=jnp.zeros((high_bits.size, side), jnp.uint32),
+        round=jnp.zeros((), jnp.int32),
     )
-    reached, _, low, high, _ = jax.lax.while_loop(lambda carry: carry[1], search, start)
-    bits = jax.vmap(unpack)(jnp.concatenate([jnp.stack(low), high])).astype(jnp.int32)
+    end = jax.lax.while_loop(lambda search: search.grows, one_round, start)
+    bits = jax.vmap(unpack)(jnp.concatenate([jnp.stack(end.low), end.high])).astype(jnp.int32)
     steps = 1 + jnp.sum(bits << jnp.arange(len(bits))[:, None, None], axis=0)
-    return jnp.where(unpack(reached), steps, -1).at[tuple(source)].set(0)
+    return jnp.where(unpack(end.reached), steps, -1).at[tuple(source)].set(0)
+
+
+class _Toward(NamedTuple):
+    """A search from the target until it meets a neighbor of the source."""
+
+    reached: UInt32[Array, "S"]
+    found: UInt32[Array, "S"]
+    """The neighbors that it met first."""
+    goes_on: Bool[Array, ""]
 
 
 def toward(
@@ -96,17 +123,16 @@ def toward(
     neighbors = spread(single(source, side)) & ~single(source, side)
     open_ = pack(free) | origin
 
-    def search(carry: Any) -> Any:
-        reached, found, _ = carry
-        grown = reached
+    def one_round(search: _Toward) -> _Toward:
+        reached, found, _ = search
         for _ in range(ROUND):
             searching = ~jnp.any(found)
             grown = spread(reached) & open_
             found = jnp.where(searching, grown & neighbors, found)
             more = jnp.any(grown != reached)
             reached = grown
-        return reached, found, more & ~jnp.any(found)
+        return _Toward(reached=reached, found=found, goes_on=more & ~jnp.any(found))
 
     first = origin & neighbors
-    start = (origin, first, ~jnp.any(first))
-    return unpack(jax.lax.while_loop(lambda carry: carry[2], search, start)[1])
+    start = _Toward(reached=origin, found=first, goes_on=~jnp.any(first))
+    return unpack(jax.lax.while_loop(lambda search: search.goes_on, one_round, start).found)

@@ -8,6 +8,7 @@ step penalty). Rows count downwards, columns to the right; north is row - 1. The
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -15,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from envs.base import EnvSpec, TimeStep
-from envs.bitboard import distances
+from envs.base import ArraySpec, Discrete, Environment, EnvSpec, TimeStep
+from envs.maze.bitboard import distances
 
 WEST, NORTH, EAST, SOUTH, STAY = range(5)
 MOVES = ((0, -1), (-1, 0), (0, 1), (1, 0), (0, 0))
@@ -43,7 +44,7 @@ class MazeState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class MazeRunner:
+class MazeRunner(Environment):
     """The maze world for mazes of odd side length ``side``."""
 
     name: str
@@ -54,15 +55,12 @@ class MazeRunner:
     def spec(self) -> EnvSpec:
         return EnvSpec(
             name=self.name,
-            obs_dim=6,
+            obs=ArraySpec((6,)),
             goal_dim=2,
-            action_dim=5,
-            discrete=True,
+            actions=Discrete(len(MOVES)),
             horizon=self.horizon,
             return_range=(-STEP_PENALTY * self.horizon, GOAL_REWARD - STEP_PENALTY),
             truncate_in_hindsight=True,
-            deterministic=True,
-            reward_confirms_goals=False,
         )
 
     @property
@@ -77,20 +75,22 @@ class MazeRunner:
         reachable = distances(maze == 0, jnp.asarray(self.start)) >= 0
         weight = reachable.at[self.start].set(False).ravel()
         cell = jax.random.choice(key_goal, self.side**2, p=weight / weight.sum())
-        return MazeTask(maze, jnp.stack([cell // self.side, cell % self.side]))
+        return MazeTask(maze=maze, goal=jnp.stack([cell // self.side, cell % self.side]))
 
     def sample_goal(self, key: PRNGKeyArray) -> Float[Array, "2"]:
+        """Any cell inside of the border, a wall or not."""
         cell = jax.random.randint(key, (2,), 1, self.side - 1)
         return self.goal_at(cell)
 
     def goal_at(self, position: Int[Array, "2"]) -> Float[Array, "2"]:
+        """A cell as a goal: row and column in units of the side."""
         return position.astype(jnp.float32) / self.side
 
     def task_goal(self, task: MazeTask) -> Float[Array, "2"]:
         return self.goal_at(task.goal)
 
     def optimal_return(self, task: MazeTask) -> Float[Array, ""]:
-        """1 - 0.1 x shortest path (worst return where the goal is too far or cut off)."""
+        """1 - 0.1 x steps of the shortest path; the worst return where the goal is out of reach."""
         length = self._shortest_path(task)
         reachable = (length >= 0) & (length <= self.horizon)
         return jnp.where(
@@ -105,15 +105,10 @@ class MazeRunner:
         """The walls: a test maze must not occur in training with any goal."""
         return task.maze.ravel()
 
-    def check_task(self, task: MazeTask) -> None:
-        maze, goal = np.asarray(task.maze), np.asarray(task.goal)
+    def check_task(self, tasks: MazeTask) -> None:
+        super().check_task(tasks)
+        maze, goal = np.asarray(tasks.maze), np.asarray(tasks.goal)
         side, start = self.side, self.start
-        if maze.ndim != 3 or maze.shape[1:] != (side, side):
-            raise ValueError(f"maze must have shape [N, {side}, {side}], found {list(maze.shape)}")
-        if goal.shape != (len(maze), 2):
-            raise ValueError(f"goal must have shape [{len(maze)}, 2], found {list(goal.shape)}")
-        if not np.issubdtype(goal.dtype, np.integer):
-            raise ValueError(f"goal must hold integers (row, column), found {goal.dtype}")
         if not np.isin(maze, (0, 1)).all():
             raise ValueError("maze must hold 0 (free) and 1 (wall) only")
         border = np.concatenate([maze[:, [0, -1]], maze[:, :, [0, -1]].swapaxes(1, 2)], axis=1)
@@ -126,15 +121,19 @@ class MazeRunner:
                 raise ValueError(f"task {index}: goal ({row}, {column}) is not a free cell")
             if (row, column) == start:
                 raise ValueError(f"task {index}: goal ({row}, {column}) is the start cell")
-        batch = MazeTask(jnp.asarray(maze), jnp.asarray(goal))
-        for index, steps in enumerate(jax.vmap(self._shortest_path)(batch).tolist()):
+        batch = MazeTask(maze=jnp.asarray(maze), goal=jnp.asarray(goal))
+        for index, steps in enumerate(jax.jit(jax.vmap(self._shortest_path))(batch).tolist()):
             if steps < 0:
                 raise ValueError(f"task {index}: no free path leads from the start to the goal")
 
     def reset(self, key: PRNGKeyArray, task: MazeTask) -> tuple[MazeState, TimeStep]:
         del key  # the start is always the same
-        position = jnp.asarray(self.start, jnp.int32)
-        state = MazeState(task, position, jnp.zeros((), jnp.int32), jnp.zeros((), bool))
+        state = MazeState(
+            task=task,
+            position=jnp.asarray(self.start, jnp.int32),
+            steps=jnp.zeros((), jnp.int32),
+            done=jnp.zeros((), bool),
+        )
         return state, self._observe(state, jnp.zeros(()), jnp.zeros((), bool))
 
     def step(self, state: MazeState, action: Int[Array, ""]) -> tuple[MazeState, TimeStep]:
@@ -145,7 +144,7 @@ class MazeRunner:
         reward = jnp.where(state.done, 0.0, GOAL_REWARD * at_goal - STEP_PENALTY)
         steps = state.steps + ~state.done
         done = state.done | at_goal | (steps >= self.horizon)
-        state = MazeState(state.task, moved, steps, done)
+        state = MazeState(task=state.task, position=moved, steps=steps, done=done)
         return state, self._observe(state, reward, at_goal)
 
     def _observe(
@@ -155,7 +154,7 @@ class MazeRunner:
         rays = free_cells(state.task.maze, state.position).astype(jnp.float32) / self.side
         return TimeStep(
             obs=jnp.concatenate([goal, rays]),
-            goal=goal,
+            achieved_goal=goal,
             goal_reached=jnp.ones((), bool),
             outcome=goal,
             reward=reward,
@@ -190,6 +189,19 @@ def cells_in_sight(maze: Int[Array, "S S"], position: Int[Array, "2"]) -> Bool[A
     return in_row | in_column
 
 
+class _Walk(NamedTuple):
+    """A maze that is being built; nodes are its even cells, counted in twos."""
+
+    maze: Int[Array, "S S"]
+    node: Int[Array, "2"]
+    """Where the present wall has grown to."""
+    looks_left: Int[Array, ""]
+    """Looks around that the present wall has left."""
+    islands_left: Int[Array, ""]
+    """Walls that are still to begin; -1 once the last one has grown."""
+    key: PRNGKeyArray
+
+
 def generate_maze(
     key: PRNGKeyArray, side: int, complexity: float = 0.75, density: float = 0.75
 ) -> Int[Array, "S S"]:
@@ -198,55 +210,64 @@ def generate_maze(
     The classic procedure picks ``density * (side // 2)**2`` times an even cell, makes it a wall and
     grows a wall from it: ``complexity * 10 * side`` times it looks at a random even cell two steps
     away and, if that is free, walls it with the cell between and goes on from there. Most looks find
-    a wall and change nothing. Here one loop step is one *change*: the number of looks it took is
-    drawn from its geometric distribution, so mazes have the same distribution at a small part of the
-    steps.
+    a wall and change nothing. Here one loop step is one *change*: the number of looks until then is
+    drawn from its geometric distribution. The mazes have the same distribution and take far fewer
+    loop steps.
     """
     num_islands = int(density * (side // 2) * (side // 2))
     num_looks = int(complexity * 5 * (side + side))
-    nodes = side // 2 + 1  # even cells along one axis
-    offsets = jnp.asarray(MOVES[:4])
     border = jnp.zeros((side, side), jnp.int8)
     border = border.at[jnp.array([0, -1])].set(1).at[:, jnp.array([0, -1])].set(1)
+    start = _Walk(
+        maze=border,
+        node=jnp.zeros(2, jnp.int32),
+        looks_left=jnp.int32(0),  # so that the first change begins the first wall
+        islands_left=jnp.int32(num_islands),
+        key=key,
+    )
+    end = jax.lax.while_loop(
+        lambda walk: walk.islands_left >= 0, partial(_change, num_looks=num_looks), start
+    )
+    return _clear_start(end.maze).astype(jnp.int32)
 
-    class Walk(NamedTuple):
-        maze: Int[Array, "S S"]
-        node: Int[Array, "2"]
-        looks_left: Int[Array, ""]
-        islands_left: Int[Array, ""]
-        key: PRNGKeyArray
 
-    def change(walk: Walk) -> Walk:
-        key, key_island, key_looks, key_neighbor = jax.random.split(walk.key, 4)
-        neighbors = walk.node + offsets
-        inside = jnp.all((neighbors >= 0) & (neighbors < nodes), axis=1)
-        clipped = jnp.clip(neighbors, 0, nodes - 1)
-        free = inside & (walk.maze[2 * clipped[:, 0], 2 * clipped[:, 1]] == 0)
-        # Looks until a free neighbor is found, each a uniform draw among those inside.
-        hit = free.sum() / inside.sum()
-        miss = jnp.log1p(-jnp.minimum(hit, 1 - 1e-7))
-        looks = 1 + jnp.floor(jnp.log(jax.random.uniform(key_looks, minval=1e-12)) / miss)
-        grows = jnp.any(free) & (looks <= walk.looks_left)
+def _change(walk: _Walk, num_looks: int) -> _Walk:
+    """Let the present wall grow by one node or, when its looks are used up, begin another wall."""
+    key, key_island, key_looks, key_neighbor = jax.random.split(walk.key, 4)
+    nodes = walk.maze.shape[0] // 2 + 1  # along one axis
+    neighbors = walk.node + jnp.asarray(MOVES[:4])
+    inside = jnp.all((neighbors >= 0) & (neighbors < nodes), axis=1)
+    clipped = jnp.clip(neighbors, 0, nodes - 1)
+    free = inside & (walk.maze[2 * clipped[:, 0], 2 * clipped[:, 1]] == 0)
+    # Looks until a free neighbor is found, each a uniform draw among those inside.
+    hit = free.sum() / inside.sum()
+    miss = jnp.log1p(-jnp.minimum(hit, 1 - 1e-7))
+    looks = 1 + jnp.floor(jnp.log(jax.random.uniform(key_looks, minval=1e-12)) / miss)
+    grows = jnp.any(free) & (looks <= walk.looks_left)
 
-        target = neighbors[
-            jnp.argmax(jnp.where(free, jax.random.uniform(key_neighbor, (4,)), -1.0))
-        ]
-        island = jax.random.randint(key_island, (2,), 0, nodes)
-        between = jnp.where(grows, walk.node + target, 2 * island)
-        node = jnp.where(grows, target, island)
-        looks_left = jnp.where(grows, walk.looks_left - looks.astype(jnp.int32), num_looks)
-        islands_left = walk.islands_left - ~grows
-        active = islands_left >= 0  # the last island has grown
-        rows = jnp.stack([between[0], 2 * node[0]])
-        columns = jnp.stack([between[1], 2 * node[1]])
-        walls = jnp.maximum(walk.maze[rows, columns], active.astype(jnp.int8))
-        maze = walk.maze.at[rows, columns].set(walls)
-        return Walk(maze, node, looks_left, islands_left, key)
+    scores = jnp.where(free, jax.random.uniform(key_neighbor, (4,)), -1.0)
+    target = neighbors[jnp.argmax(scores)]
+    island = jax.random.randint(key_island, (2,), 0, nodes)
+    between = jnp.where(grows, walk.node + target, 2 * island)
+    node = jnp.where(grows, target, island)
+    islands_left = walk.islands_left - ~grows
+    # Once the last wall has grown, the cells below stay what they are.
+    active = islands_left >= 0
+    rows = jnp.stack([between[0], 2 * node[0]])
+    columns = jnp.stack([between[1], 2 * node[1]])
+    walls = jnp.maximum(walk.maze[rows, columns], active.astype(jnp.int8))
+    return _Walk(
+        maze=walk.maze.at[rows, columns].set(walls),
+        node=node,
+        looks_left=jnp.where(grows, walk.looks_left - looks.astype(jnp.int32), num_looks),
+        islands_left=islands_left,
+        key=key,
+    )
 
-    start = Walk(border, jnp.zeros(2, jnp.int32), jnp.int32(0), jnp.int32(num_islands), key)
-    maze = jax.lax.while_loop(lambda walk: walk.islands_left >= 0, change, start).maze
 
+def _clear_start(maze: Int[Array, "S S"]) -> Int[Array, "S S"]:
+    """Free the four rows at the bottom but for the two walls of the corridor that agents start in."""
+    side = maze.shape[0]
+    corridor = jnp.array([side // 2 - 1, side // 2 + 1])
     maze = maze.at[side - 5 : side - 1, 1:-1].set(0)
-    middle = side // 2
-    corridor = jnp.array([middle - 1, middle + 1])
-    return maze.at[side - 4 : side - 1, corridor].set(1).astype(jnp.int32)
+    return maze.at[side - 4 : side - 1, corridor].set(1)

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from envs.base import EnvSpec, TimeStep
+from envs.base import ArraySpec, Discrete, Environment, EnvSpec, TimeStep
 
 WEST, NORTH, EAST, SOUTH, STAY, FLIP = range(6)
 MOVES = ((0, -1), (-1, 0), (0, 1), (1, 0), (0, 0), (0, 0))
@@ -53,7 +53,7 @@ class GridState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class GridWorld:
+class GridWorld(Environment):
     """The object-switching world."""
 
     name: str
@@ -63,13 +63,11 @@ class GridWorld:
     def spec(self) -> EnvSpec:
         return EnvSpec(
             name=self.name,
-            obs_dim=NUM_OBJECTS + 2,
+            obs=ArraySpec((NUM_OBJECTS + 2,)),
             goal_dim=NUM_OBJECTS,
-            action_dim=6,
-            discrete=True,
+            actions=Discrete(len(MOVES)),
             horizon=self.horizon,
             return_range=(0.0, 1.0),
-            truncate_in_hindsight=False,
             deterministic=False,
             reward_confirms_goals=True,
         )
@@ -84,7 +82,7 @@ class GridWorld:
 
     def task(self, index: Int[Array, ""]) -> GridTask:
         """The tasks in a fixed order, over and over again: shorter ones first."""
-        return GridTask(jnp.asarray(_all_orders())[index % self.num_tasks])
+        return GridTask(order=jnp.asarray(_all_orders())[index % self.num_tasks])
 
     def sample_goal(self, key: PRNGKeyArray) -> Float[Array, "G"]:
         return jax.nn.one_hot(jax.random.randint(key, (), 0, NUM_OBJECTS), NUM_OBJECTS)
@@ -102,15 +100,14 @@ class GridWorld:
         """The order: a test order must not occur in training."""
         return task.order
 
-    def check_task(self, task: GridTask) -> None:
-        order = np.asarray(task.order)
+    def check_task(self, tasks: GridTask) -> None:
+        order = np.asarray(tasks.order)
         if order.ndim != 2 or order.shape[1] != NUM_OBJECTS:
             raise ValueError(
                 f"order must have shape [N, {NUM_OBJECTS}] (filled up with {NONE}), "
                 f"found {list(order.shape)}"
             )
-        if not np.issubdtype(order.dtype, np.integer):
-            raise ValueError(f"order must hold integers, found {order.dtype}")
+        super().check_task(tasks)
         if order.min() < NONE or order.max() >= NUM_OBJECTS:
             raise ValueError(f"order must hold objects 0..{NUM_OBJECTS - 1}, or {NONE} at the end")
         for index, row in enumerate(order):
@@ -126,12 +123,18 @@ class GridWorld:
 
     def reset(self, key: PRNGKeyArray, task: GridTask) -> tuple[GridState, TimeStep]:
         """All objects off, the agent on a random cell."""
-        off = jnp.zeros(NUM_OBJECTS, bool)
-        zero = jnp.zeros((), jnp.int32)
-        position = jax.random.randint(key, (2,), 0, SIDE)
-        running = jnp.zeros((), bool)
-        state = GridState(task, position, off, off, off, zero, zero, running)
-        return state, self._observe(state, jnp.zeros(()), running)
+        none, zero = jnp.zeros(NUM_OBJECTS, bool), jnp.zeros((), jnp.int32)
+        state = GridState(
+            task=task,
+            position=jax.random.randint(key, (2,), 0, SIDE),
+            is_on=none,
+            was_on=none,
+            newly_on=none,
+            num_solved=zero,
+            steps=zero,
+            done=jnp.zeros((), bool),
+        )
+        return state, self._observe(state, reward=jnp.zeros(()), complete=jnp.zeros((), bool))
 
     def step(self, state: GridState, action: Int[Array, ""]) -> tuple[GridState, TimeStep]:
         here = jnp.all(state.position == jnp.asarray(OBJECTS), axis=1)
@@ -142,7 +145,8 @@ class GridWorld:
         order, num_solved = state.task.order, state.num_solved
         num_subtasks = jnp.sum(order != NONE)
         place = jnp.arange(NUM_OBJECTS)
-        # On: those solved and the next one; off: all later ones of the task.
+        # The reward is due when the solved objects and the next one are on and, of the task's objects, no
+        # later one is.
         in_order = jnp.all((is_on[order] == (place <= num_solved)) | (place >= num_subtasks))
         num_solved += in_order
         steps = state.steps + 1
@@ -166,7 +170,7 @@ class GridWorld:
     ) -> TimeStep:
         return TimeStep(
             obs=jnp.concatenate([state.is_on, state.position]).astype(jnp.float32),
-            goal=state.newly_on.astype(jnp.float32),
+            achieved_goal=state.newly_on.astype(jnp.float32),
             goal_reached=jnp.any(state.newly_on),
             outcome=state.was_on.astype(jnp.float32),
             reward=reward,

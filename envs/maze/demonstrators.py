@@ -6,22 +6,23 @@ unvisited cell that minimizes G + H, the known path to it plus its Manhattan dis
 chooses anew on arrival and whenever a goal is reached; ties go to the cell nearest to the goal.
 Random walks to one of the five nearest seen but unvisited cells.
 
-Known maps are bitboards (``envs.bitboard``). The path to the chosen cell is re-read from the known map
+Known maps are bitboards (``envs.maze.bitboard``). The path to the chosen cell is re-read from the known map
 at every step, so that a shortcut seen on the way is taken.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from envs.base import Agent, Demonstrator, TimeStep
-from envs.bitboard import distances, toward
-from envs.maze_runner import (
+from envs.base import Agent, Demonstrator, Episode, TimeStep, Trajectory
+from envs.maze.bitboard import distances, toward
+from envs.maze.env import (
     GOAL_REWARD,
     MOVES,
     STAY,
@@ -104,8 +105,13 @@ def _explorer(env: MazeRunner, num_goals: int, choose: ChooseTarget) -> Agent:
     ) -> tuple[Array, Array, Memory]:
         key_goals, key_choose = jax.random.split(key)
         nowhere = jnp.zeros((side, side), bool)
-        goals = draw_goals(key_goals, task)
-        memory = Memory(nowhere, nowhere, goals, jnp.zeros((), jnp.int32), state.position)
+        memory = Memory(
+            seen=nowhere,
+            visited=nowhere,
+            goals=draw_goals(key_goals, task),
+            num_reached=jnp.zeros((), jnp.int32),
+            target=state.position,
+        )
         return proceed(key_choose, memory, state, timestep)
 
     def proceed(
@@ -131,33 +137,38 @@ def _explorer(env: MazeRunner, num_goals: int, choose: ChooseTarget) -> Agent:
         action = jnp.where(jnp.any(leads_on), jnp.argmax(leads_on), STAY)
         return action, quits, memory._replace(target=target)
 
-    return Agent(begin, proceed)
+    return Agent(begin=begin, proceed=proceed)
 
 
-def first_hit_return(trajectory: Any) -> Float[Array, ""]:
+def first_hit_return(trajectory: Trajectory) -> Float[Array, ""]:
     """The return of a trajectory on the task whose goal is where the trajectory ends."""
-    arrived = jnp.all(trajectory.goals == trajectory.goals[trajectory.length - 1], axis=-1)
+    goals = trajectory.achieved_goals
+    arrived = jnp.all(goals == goals[trajectory.length - 1], axis=-1)
     return GOAL_REWARD - STEP_PENALTY * (1 + jnp.argmax(arrived))
 
 
 def maze_demonstrators(env: MazeRunner) -> dict[str, Demonstrator]:
-    """The datasets of Table 5 by name."""
+    """The datasets of Table 5 by name, the one of the paper's main results first."""
 
     def endless_task(key: PRNGKeyArray, index: Int[Array, ""]) -> MazeTask:
         """A random maze whose goal is a wall, so that only the demonstrator ends the episode."""
         del index
-        return MazeTask(generate_maze(key, env.side), jnp.zeros(2, jnp.int32))
+        return MazeTask(maze=generate_maze(key, env.side), goal=jnp.zeros(2, jnp.int32))
 
-    def long_enough(episode: Any) -> Bool[Array, "*batch"]:
+    def long_enough(episode: Episode) -> Bool[Array, "*batch"]:
         return episode.trajectory.length >= MIN_LENGTH
 
-    agents = {
-        "astar1": astar(env, 1),
-        "astar2": astar(env, 2),
-        "astar4": astar(env, 4),
-        "random": random_walk(env),
-    }
+    def demonstrator(make_agent: Callable[[], Agent]) -> Demonstrator:
+        return Demonstrator(
+            sample_task=endless_task,
+            agent=lambda weights: make_agent(),
+            keeps=long_enough,
+            hindsight_return=first_hit_return,
+        )
+
     return {
-        name: Demonstrator(endless_task, agent, long_enough, first_hit_return)
-        for name, agent in agents.items()
+        "astar4": demonstrator(partial(astar, env, num_goals=4)),
+        "astar1": demonstrator(partial(astar, env, num_goals=1)),
+        "astar2": demonstrator(partial(astar, env, num_goals=2)),
+        "random": demonstrator(partial(random_walk, env)),
     }

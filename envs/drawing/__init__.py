@@ -1,0 +1,24 @@
+"""What the pictures of all worlds share: the record of what a world draws, marks, colors and GIFs."""
+
+from __future__ import annotations
+
+from envs.drawing.marks import draw_box, draw_disc, draw_leader, spread_apart
+from envs.drawing.palette import INK
+from envs.drawing.pictures import Pictures, Shown, Stage, observations
+from envs.drawing.video import Film, axes_in_a_row, write_films, write_gif
+
+__all__ = [
+    "INK",
+    "Film",
+    "Pictures",
+    "Shown",
+    "Stage",
+    "axes_in_a_row",
+    "draw_box",
+    "draw_disc",
+    "draw_leader",
+    "observations",
+    "spread_apart",
+    "write_films",
+    "write_gif",
+]

@@ -1,0 +1,172 @@
+"""The only episode loop: policies, baselines and demonstrators all act through it.
+
+Under ``jax.vmap`` all episodes share one clock, and the loop ends with the last live one. A ``while_loop``
+whose condition differs between lanes would have to select, at every step, between the old and the new of
+everything it carries, whole key-value caches included; here the condition is one scalar for all lanes.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int, PRNGKeyArray
+
+from envs.base import Agent, Environment, Episode, State, Task, TimeStep, Trajectory
+
+# The loop runs in segments, between which the agent's memory grows. More segments make a step cost what
+# has been seen rather than the horizon, and take longer to compile.
+MAX_SEGMENTS = 8
+SEGMENT_STEPS = 32  # an episode is not cut into shorter segments than this
+
+
+def num_segments(horizon: int) -> int:
+    """How many segments an episode of at most ``horizon`` steps runs in."""
+    return max(1, min(MAX_SEGMENTS, horizon // SEGMENT_STEPS))
+
+
+def segment_length(horizon: int) -> int:
+    """How many steps a segment has, except that the last one may be shorter."""
+    return -(-horizon // num_segments(horizon))
+
+
+@jax.custom_batching.custom_vmap
+def _anyone(alive: Bool[Array, ""]) -> Bool[Array, ""]:
+    """Whether this episode, or under ``vmap`` any of the batch, is still running."""
+    return alive
+
+
+@_anyone.def_vmap
+def _anyone_of_batch(size: int, batched: Any, alive: Bool[Array, "B"]) -> tuple[Array, bool]:
+    del size, batched
+    return _anyone(jnp.any(alive)), False
+
+
+class _Loop(NamedTuple):
+    """State of an episode in progress; ``trajectory`` and ``rewards`` hold its steps so far."""
+
+    time: Int[Array, ""]
+    anyone_alive: Bool[Array, ""]
+    alive: Bool[Array, ""]
+    state: State
+    timestep: TimeStep
+    memory: Any
+    trajectory: Trajectory
+    rewards: Array
+    return_: Array
+    last_obs: Array
+
+
+def run_episode(key: PRNGKeyArray, env: Environment, agent: Agent, task: Task) -> Episode:
+    """One episode of ``agent`` on ``task``, of at most ``env.spec.horizon`` steps.
+
+    Args:
+      key: random key.
+      env: the world (static).
+      agent: who acts.
+      task: one task of the world.
+    """
+    horizon = env.spec.horizon
+    key_reset, key_begin, key_steps = jax.random.split(key, 3)
+    state, timestep = env.reset(key_reset, task)
+    action, quits, memory = agent.begin(key_begin, task, state, timestep)
+    loop = _Loop(
+        time=jnp.zeros((), jnp.int32),
+        anyone_alive=jnp.ones((), bool),
+        alive=~quits,
+        state=state,
+        timestep=timestep,
+        memory=memory,
+        trajectory=_blank(horizon, action, timestep),
+        rewards=jnp.zeros(horizon),
+        return_=jnp.zeros(()),
+        last_obs=timestep.obs,
+    )
+    loop = _act(env, loop, action)
+
+    def advance(loop: _Loop) -> _Loop:
+        step_key = jax.random.fold_in(key_steps, loop.time)
+        action, quits, memory = agent.proceed(step_key, loop.memory, loop.state, loop.timestep)
+        return _act(env, loop._replace(alive=loop.alive & ~quits, memory=memory), action)
+
+    segment = segment_length(horizon)
+    for start in range(1, horizon, segment):
+        end = min(start + segment, horizon)
+        loop = loop._replace(memory=agent.grow(loop.memory, end - start))
+        loop = jax.lax.while_loop(
+            lambda loop, end=end: loop.anyone_alive & (loop.time < end), advance, loop
+        )
+    return Episode(
+        trajectory=loop.trajectory,
+        rewards=loop.rewards,
+        return_=loop.return_,
+        last_obs=loop.last_obs,
+        failed=loop.timestep.failed,
+        decisions=agent.decisions(loop.memory),
+    )
+
+
+def replay(
+    key: PRNGKeyArray, env: Environment, task: Task, actions: Array, length: Array
+) -> Episode:
+    """The episode that had this ``key`` and these ``actions [T, ..]``, of which ``length`` are real."""
+
+    def begin(key: PRNGKeyArray, task: Task, state: State, timestep: TimeStep) -> tuple:
+        del key, task, state, timestep
+        return actions[0], length < 1, jnp.ones((), jnp.int32)
+
+    def proceed(key: PRNGKeyArray, time: Array, state: State, timestep: TimeStep) -> tuple:
+        del key, state, timestep
+        return actions[jnp.minimum(time, len(actions) - 1)], time >= length, time + 1
+
+    return run_episode(key, env, Agent(begin, proceed), task)
+
+
+def _blank(horizon: int, action: Array, timestep: TimeStep) -> Trajectory:
+    """A trajectory of no steps with room for ``horizon``."""
+
+    def rows(row: Array) -> Array:
+        return jnp.zeros((horizon, *row.shape), row.dtype)
+
+    return Trajectory(
+        obs=rows(timestep.obs),
+        actions=rows(action),
+        achieved_goals=rows(timestep.achieved_goal),
+        goal_reached=jnp.zeros(horizon, bool),
+        outcomes=rows(timestep.outcome),
+        length=jnp.zeros((), jnp.int32),
+    )
+
+
+def _act(env: Environment, loop: _Loop, action: Array) -> _Loop:
+    """Take one action and record what came of it, unless the episode has ended."""
+    alive = loop.alive
+
+    def put(rows: Array, row: Array) -> Array:
+        row = jnp.where(alive, row, 0).astype(rows.dtype)
+        return jax.lax.dynamic_update_index_in_dim(rows, row, loop.time, 0)
+
+    state, timestep = env.step(loop.state, action)
+    record = loop.trajectory
+    goes_on = alive & ~timestep.terminated & ~timestep.truncated
+    return _Loop(
+        time=loop.time + 1,
+        anyone_alive=_anyone(goes_on),
+        alive=goes_on,
+        state=state,
+        timestep=timestep,
+        memory=loop.memory,
+        trajectory=Trajectory(
+            obs=put(record.obs, loop.timestep.obs),
+            actions=put(record.actions, action),
+            achieved_goals=put(record.achieved_goals, timestep.achieved_goal),
+            goal_reached=put(record.goal_reached, timestep.goal_reached),
+            outcomes=put(record.outcomes, timestep.outcome),
+            length=record.length + alive,
+        ),
+        rewards=put(loop.rewards, timestep.reward),
+        # Summed step by step: equal rewards make equal returns, whenever they came.
+        return_=loop.return_ + jnp.where(alive, timestep.reward, 0.0),
+        last_obs=jnp.where(alive, timestep.obs, loop.last_obs),
+    )

@@ -1,0 +1,49 @@
+"""GridWorld: switch on objects in an order that is not told. Nothing here imports jax."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from envs.registry import Judgement, World
+
+if TYPE_CHECKING:
+    from envs.base import Demonstrator
+    from envs.drawing import Pictures
+    from envs.gridworld.env import GridWorld
+
+__all__ = ["GRIDWORLD"]
+
+
+def make() -> GridWorld:
+    from envs.gridworld.env import GridWorld
+
+    return GridWorld(name="gridworld", horizon=90)
+
+
+def load_demonstrators(env: GridWorld) -> Mapping[str, Demonstrator]:
+    from envs.gridworld.demonstrators import grid_demonstrators
+
+    return grid_demonstrators(env)
+
+
+def load_pictures(env: GridWorld) -> Pictures:
+    from envs.gridworld.pictures import grid_pictures
+
+    return grid_pictures(env)
+
+
+GRIDWORLD = World(
+    name="gridworld",
+    make=make,
+    summary="switch on 3 to 7 objects on a 10 x 10 grid in an order that is not told",
+    demonstrators=load_demonstrators,
+    presets={
+        # Each of the 13,600 training tasks five times.
+        "fast": {"steps": 3_000, "episodes": 68_000, "max_prompt_length": 8, "bucket": 8},
+        "paper": {"steps": 50_000, "episodes": 13_600, "max_prompt_length": 8, "bucket": 8},
+    },
+    pictures=load_pictures,
+    # Episodes start on a random cell, so one return says little about a prompt.
+    judged=Judgement(mode="greedy", episodes=10),
+)

@@ -1,0 +1,73 @@
+"""MazeRunner in the paper's two sizes. Nothing here imports jax."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from envs.registry import World
+
+if TYPE_CHECKING:
+    from envs.base import Demonstrator
+    from envs.drawing import Pictures
+    from envs.maze.env import MazeRunner
+
+__all__ = ["MAZE15", "MAZE30"]
+
+
+def make15() -> MazeRunner:
+    from envs.maze.env import MazeRunner
+
+    return MazeRunner(name="maze15", side=15, horizon=64)
+
+
+def make30() -> MazeRunner:
+    """The paper calls its size 30; walls lie on even cells, so a side is odd."""
+    from envs.maze.env import MazeRunner
+
+    return MazeRunner(name="maze30", side=31, horizon=500)
+
+
+def load_demonstrators(env: MazeRunner) -> Mapping[str, Demonstrator]:
+    from envs.maze.demonstrators import maze_demonstrators
+
+    return maze_demonstrators(env)
+
+
+def load_pictures(env: MazeRunner) -> Pictures:
+    from envs.maze.pictures import maze_pictures
+
+    return maze_pictures(env)
+
+
+MAZE15 = World(
+    name="maze15",
+    make=make15,
+    summary="MazeRunner: find a goal in an unknown maze of 15 x 15 cells within 64 steps",
+    demonstrators=load_demonstrators,
+    presets={
+        # 10,000 trajectories are soon overfitted; 100,000 are not, and take a minute to collect.
+        "fast": {"steps": 8_000, "episodes": 100_000},
+        "paper": {"steps": 50_000, "episodes": 10_000},  # steps as in the authors' code
+    },
+    pictures=load_pictures,
+)
+
+MAZE30 = World(
+    name="maze30",
+    make=make30,
+    summary="MazeRunner: find a goal in an unknown maze of 31 x 31 cells within 500 steps",
+    demonstrators=load_demonstrators,
+    presets={
+        "fast": {
+            "steps": 5_000,
+            "episodes": 30_000,
+            "max_prompt_length": 20,
+            "bucket": 32,
+            "demonstrator": "astar2",
+            "save_every": 250,
+        },
+        "paper": {"steps": 200_000, "episodes": 10_000, "bucket": 32},
+    },
+    pictures=load_pictures,
+)

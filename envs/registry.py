@@ -1,0 +1,180 @@
+"""The worlds by name, and the record that describes one. Nothing here imports jax.
+
+A world is found under a name that it was registered with, under the name of an entry point in the group
+``mgpo_jax.worlds``, or as ``module:attribute``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import entry_points
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
+
+from envs.errors import UsageError, nearest
+
+if TYPE_CHECKING:
+    from envs.base import Demonstrator, Environment
+    from envs.drawing import Pictures
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """How the policies of a world are judged: in episodes outside of the budget of a search.
+
+    Attributes:
+      mode: ``greedy`` acts by the likeliest action, ``sample`` by a random one.
+      temperature: of the distribution that ``sample`` draws from; 1 leaves it as it is.
+      episodes: number of episodes whose returns are averaged.
+    """
+
+    mode: Literal["greedy", "sample"] = "greedy"
+    temperature: float = 1.0
+    episodes: int = 1
+
+
+def _no_demonstrators(env: Environment) -> Mapping[str, Demonstrator]:
+    return {}
+
+
+@dataclass(frozen=True, kw_only=True)
+class World:
+    """Everything that generic code needs to know of a world.
+
+    Attributes:
+      name: what ``--env`` calls it.
+      make: builds the environment.
+      summary: what it is, in one line.
+      demonstrators: the agents that can collect a dataset, by name; the first is the default. A world
+        without any needs a dataset from elsewhere.
+      presets: what the world's training settings change in the general ones, by preset (``fast``,
+        ``paper``, ``smoke``): names and values of settings of ``experiments.pretrain``.
+      pictures: what the world draws; None draws learning curves only.
+      policy_of: the world whose released policy and test tasks this one uses [its own].
+      judged: how policies are judged here; every table follows it.
+      num_test_tasks: how many tasks are kept for test.
+    """
+
+    name: str
+    make: Callable[[], Environment]
+    summary: str = ""
+    demonstrators: Callable[[Any], Mapping[str, Demonstrator]] = _no_demonstrators
+    presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    pictures: Callable[[Any], Pictures] | None = None
+    policy_of: str | None = None
+    judged: Judgement = field(default_factory=Judgement)
+    num_test_tasks: int = 50
+
+    @property
+    def home(self) -> str:
+        """The name under which its released policy, test tasks, datasets and paper numbers are kept."""
+        return self.policy_of or self.name
+
+
+Record = TypeVar("Record")
+
+
+class Registry(Generic[Record]):
+    """Records by name: those registered, those of an entry-point group, and ``module:attribute``."""
+
+    def __init__(self, kind: str, type_: type[Record], group: str, built_in: Mapping[str, str]):
+        self.kind, self.type, self.group = kind, type_, group
+        self._places = dict(built_in)
+        self._registered: dict[str, Record] = {}
+        self._loaded: dict[str, Record] = {}  # by place
+
+    def register(self, record: Record) -> Record:
+        """Make a record known under its name; returns it.
+
+        Raises:
+          UsageError: if another record has that name.
+        """
+        name: str = record.name  # type: ignore[attr-defined]
+        if self._registered.get(name, record) != record or name in self._places:
+            raise UsageError(f"there is a {self.kind} {name!r} already; choose another name")
+        self._registered[name] = record
+        return record
+
+    def names(self) -> list[str]:
+        """All names, the built-in ones first; nothing is imported for it."""
+        found = [point.name for point in entry_points(group=self.group)]
+        return list(dict.fromkeys([*self._places, *self._registered, *found]))
+
+    def find(self, name: str) -> Record:
+        """The record of that name.
+
+        Raises:
+          UsageError: if there is none, with the nearest name, or if it cannot be imported.
+        """
+        if name in self._registered:
+            return self._registered[name]
+        place = self._places.get(name)
+        if place is None:
+            points = {point.name: point.value for point in entry_points(group=self.group)}
+            place = points.get(name) or (name if ":" in name else None)
+        if place is None:
+            raise nearest(name, self.names(), self.kind)
+        if place not in self._loaded:
+            self._loaded[place] = self._load(place)
+        return self._loaded[place]
+
+    def _load(self, place: str) -> Record:
+        module, _, attribute = place.partition(":")
+        here = os.getcwd()
+        if here not in sys.path:
+            sys.path.append(here)  # last, so that the current folder never shadows a package
+        try:
+            record = getattr(importlib.import_module(module), attribute)
+        except (ImportError, AttributeError) as error:
+            raise UsageError(f"cannot load the {self.kind} {place!r}: {error}") from None
+        if not isinstance(record, self.type):
+            raise UsageError(
+                f"{place} is a {type(record).__name__}, not a {self.type.__name__} record"
+            )
+        return record
+
+
+WORLDS: Registry[World] = Registry(
+    "world",
+    World,
+    "mgpo_jax.worlds",
+    {
+        "maze15": "envs.maze:MAZE15",
+        "maze30": "envs.maze:MAZE30",
+        "gridworld": "envs.gridworld:GRIDWORLD",
+        "kitchen": "envs.kitchen:KITCHEN",
+        "kitchen-mjx": "envs.kitchen:KITCHEN_MJX",
+        "kitchen-native": "envs.kitchen:KITCHEN_NATIVE",
+        "kitchen-stock": "envs.kitchen:KITCHEN_STOCK",
+    },
+)
+
+
+def register(world: World) -> World:
+    """Make a world known under its name; returns it."""
+    return WORLDS.register(world)
+
+
+def names() -> list[str]:
+    """The names of all worlds."""
+    return WORLDS.names()
+
+
+def find(name: str) -> World:
+    """The record of a world, by its name or as ``module:attribute``."""
+    return WORLDS.find(name)
+
+
+def make(name: str) -> Environment:
+    """The environment of a world, by its name or as ``module:attribute``.
+
+    Raises:
+      UsageError: if there is no such world, or what it needs is not installed.
+    """
+    try:
+        return find(name).make()
+    except ImportError as error:
+        raise UsageError(str(error)) from None
