@@ -1,1 +1,90 @@
-"""Pre-trained multi-goal Transformers with prompt optimization: the method."""
+"""Pre-trained multi-goal Transformers with prompt optimization.
+
+This is the public interface: load a policy, make or register a world, adapt to tasks, evaluate prompts,
+act step by step outside of any program, pre-train on a dataset. Importing the package imports no jax; every
+name is loaded when it is first used.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from envs.base import (
+        Agent,
+        ArraySpec,
+        Box,
+        Demonstrator,
+        Discrete,
+        Environment,
+        EnvSpec,
+        Episode,
+        TimeStep,
+        Trajectory,
+    )
+    from envs.errors import DataError, UsageError
+    from envs.registry import Judgement, World, make
+    from envs.registry import names as world_names
+    from envs.registry import register as register_world
+    from mgpo_jax.acting import Actor
+    from mgpo_jax.adaptation import Adapter, AdaptResult, search
+    from mgpo_jax.dataset import Dataset, load_dataset, save_dataset
+    from mgpo_jax.methods import Method, Setting
+    from mgpo_jax.methods import names as method_names
+    from mgpo_jax.methods import register as register_method
+    from mgpo_jax.optimizers import SearchSpace, bbt, bpe, explore, grips, ucb
+    from mgpo_jax.optimizers.methods import prompt_adapter
+    from mgpo_jax.policy import LoadedPolicy, Policy
+    from mgpo_jax.policy_files import load_policy, save_policy
+    from mgpo_jax.prompts import Prompt, prompt_of, sample_prompt
+    from mgpo_jax.rollout import Query
+    from mgpo_jax.runner import Outcome, adapt, evaluate, play, sweep
+    from mgpo_jax.settings import TrainConfig
+    from mgpo_jax.tasks import load_tasks, sample_tasks, save_tasks, test_tasks
+    from mgpo_jax.training import pretrain
+
+_PLACES = {
+    "envs.base": (
+        "Agent", "ArraySpec", "Box", "Demonstrator", "Discrete", "EnvSpec", "Environment", "Episode",
+        "TimeStep", "Trajectory",
+    ),
+    "envs.errors": ("DataError", "UsageError"),
+    "envs.registry": ("Judgement", "World", "make"),
+    "mgpo_jax.acting": ("Actor",),
+    "mgpo_jax.adaptation": ("AdaptResult", "Adapter", "search"),
+    "mgpo_jax.dataset": ("Dataset", "load_dataset", "save_dataset"),
+    "mgpo_jax.methods": ("Method", "Setting"),
+    "mgpo_jax.optimizers": ("SearchSpace", "bbt", "bpe", "explore", "grips", "ucb"),
+    "mgpo_jax.optimizers.methods": ("prompt_adapter",),
+    "mgpo_jax.policy": ("LoadedPolicy", "Policy"),
+    "mgpo_jax.policy_files": ("load_policy", "save_policy"),
+    "mgpo_jax.prompts": ("Prompt", "prompt_of", "sample_prompt"),
+    "mgpo_jax.rollout": ("Query",),
+    "mgpo_jax.runner": ("Outcome", "adapt", "evaluate", "play", "sweep"),
+    "mgpo_jax.settings": ("TrainConfig",),
+    "mgpo_jax.tasks": ("load_tasks", "sample_tasks", "save_tasks", "test_tasks"),
+    "mgpo_jax.training": ("pretrain",),
+}  # fmt: skip
+_RENAMED = {
+    "world_names": ("envs.registry", "names"),
+    "register_world": ("envs.registry", "register"),
+    "method_names": ("mgpo_jax.methods", "names"),
+    "register_method": ("mgpo_jax.methods", "register"),
+}
+_PLACE_OF = {name: (module, name) for module, of in _PLACES.items() for name in of} | _RENAMED
+
+__all__ = [  # noqa: PLE0604
+    *sorted(_PLACE_OF)
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PLACE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, attribute = _PLACE_OF[name]
+    return getattr(importlib.import_module(module), attribute)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

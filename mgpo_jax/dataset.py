@@ -15,27 +15,29 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from envs.base import EnvSpec
-from mgpo_jax.errors import DataError
-from mgpo_jax.files import hash_file, load_arrays, new_folder
-from mgpo_jax.types import Trajectory
+from envs.base import EnvSpec, Trajectory
+from envs.errors import DataError
+from mgpo_jax.files import hash_file, load_arrays, new_folder, read_object
 
-FORMAT = 1
+FORMAT = 2  # 1 had neither rewards nor last observations, and called achieved goals "goals"
 ARRAYS = "trajectories.npz"
 MANIFEST = "manifest.json"
+STEP_ARRAYS = Trajectory._fields[:-1]  # those with a row for every step
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Dataset:
     """N trajectories, concatenated over time; trajectory ``i`` is ``steps[starts[i]:][:lengths[i]]``."""
 
-    obs: np.ndarray  # [total, D] float32
+    obs: np.ndarray  # [total, ...] in the dtype of the world
     actions: np.ndarray  # [total] int32, or [total, A] float32
-    goals: np.ndarray  # [total, G] float32
+    achieved_goals: np.ndarray  # [total, G] float32
     goal_reached: np.ndarray  # [total] bool
     outcomes: np.ndarray  # [total, G] float32
     lengths: np.ndarray  # [N] int32
-    task_hashes: np.ndarray  # [N] uint64, of ``Environment.fingerprint``
+    task_hashes: np.ndarray | None = None  # [N] uint64, of ``Environment.fingerprint``
+    rewards: np.ndarray | None = None  # [total] float32
+    last_obs: np.ndarray | None = None  # [N, ...], the observation after the last action
 
     @property
     def starts(self) -> np.ndarray:
@@ -44,13 +46,21 @@ class Dataset:
     def __len__(self) -> int:
         return len(self.lengths)
 
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arrays that there are, by name."""
+        return {name: array for name, array in vars(self).items() if array is not None}
+
     def slice(self, begin: int, end: int) -> Dataset:
         """Trajectories ``begin`` to ``end``, as a view."""
         first = int(self.lengths[:begin].sum())
         last = int(self.lengths[:end].sum())
-        step_arrays = {name: getattr(self, name)[first:last] for name in Trajectory._fields[:-1]}
+        by_step = (*STEP_ARRAYS, "rewards")
         return Dataset(
-            lengths=self.lengths[begin:end], task_hashes=self.task_hashes[begin:end], **step_arrays
+            **{
+                name: array[first:last] if name in by_step else array[begin:end]
+                for name, array in self.arrays.items()
+            }
         )
 
     def gather(self, indices: np.ndarray, lengths: np.ndarray, num_steps: int) -> Trajectory:
@@ -59,13 +69,13 @@ class Dataset:
         real = time < lengths[:, None]
         rows = np.where(real, self.starts[indices][:, None] + time, 0)
 
-        def padded(steps: np.ndarray) -> np.ndarray:
+        def padded(steps: np.ndarray) -> Any:
             mask = real.reshape(real.shape + (1,) * (steps.ndim - 1))
             return np.where(mask, steps[rows], np.zeros((), steps.dtype))
 
-        arrays: list[Any] = [padded(getattr(self, name)) for name in Trajectory._fields[:-1]]
+        arrays = {name: padded(getattr(self, name)) for name in STEP_ARRAYS}
         length: Any = lengths.astype(np.int32)  # numpy arrays go where jax's do
-        return Trajectory(*arrays, length=length)
+        return Trajectory(**arrays, length=length)
 
 
 def hash_task(fingerprint: np.ndarray) -> np.uint64:
@@ -77,7 +87,7 @@ def hash_task(fingerprint: np.ndarray) -> np.uint64:
 def save_dataset(folder: Path, dataset: Dataset, manifest: dict[str, Any]) -> None:
     """Write a dataset; the folder appears only when it is complete."""
     with new_folder(Path(folder)) as partial:
-        np.savez_compressed(partial / ARRAYS, allow_pickle=False, **vars(dataset))
+        np.savez_compressed(partial / ARRAYS, allow_pickle=False, **dataset.arrays)
         manifest = {
             "format": FORMAT,
             "sha256": hash_file(partial / ARRAYS),
@@ -102,22 +112,21 @@ def load_dataset(folder: Path, spec: EnvSpec | None = None) -> tuple[Dataset, di
     remake = f"remove {folder} and collect it again"
     if not (folder / MANIFEST).is_file():
         raise DataError(f"no dataset in {folder} ({MANIFEST} is missing)")
-    try:
-        manifest = json.loads((folder / MANIFEST).read_text())
-    except ValueError:
-        raise DataError(f"{folder / MANIFEST} is not readable JSON; {remake}") from None
-    if not isinstance(manifest, dict):
-        raise DataError(f"{folder / MANIFEST} does not hold a JSON object; {remake}")
-    if manifest.get("format") != FORMAT:
+    manifest = read_object(folder / MANIFEST, remake)
+    if manifest.get("format") not in (1, FORMAT):
         raise DataError(
-            f"{folder} has format {manifest.get('format')}, this version reads {FORMAT}"
+            f"{folder} has format {manifest.get('format')}, this version reads 1 and {FORMAT}; "
+            f"{remake}"
         )
     path = folder / ARRAYS
     if not path.is_file() or hash_file(path) != manifest.get("sha256"):
         raise DataError(f"{path} is missing or differs from the hash in its manifest; {remake}")
     try:
-        dataset = Dataset(**load_arrays(path))
-    except (DataError, TypeError):
+        arrays = load_arrays(path)
+        if manifest["format"] == 1:
+            arrays["achieved_goals"] = arrays.pop("goals")
+        dataset = Dataset(**arrays)
+    except (DataError, KeyError, TypeError):
         raise DataError(f"{path} does not hold the arrays of a dataset; {remake}") from None
     check_dataset(dataset, path, spec)
     return dataset, manifest
@@ -125,38 +134,50 @@ def load_dataset(folder: Path, spec: EnvSpec | None = None) -> tuple[Dataset, di
 
 def check_dataset(dataset: Dataset, where: Path | str, spec: EnvSpec | None = None) -> None:
     """Raise ``DataError`` with the first thing that is wrong with a dataset."""
-    if dataset.lengths.ndim != 1 or not np.issubdtype(dataset.lengths.dtype, np.integer):
+    lengths = dataset.lengths
+    if lengths.ndim != 1 or not np.issubdtype(lengths.dtype, np.integer):
         raise DataError(f"{where}: lengths must be a list of integers")
-    if dataset.task_hashes.shape != dataset.lengths.shape:
+    if dataset.task_hashes is not None and dataset.task_hashes.shape != lengths.shape:
         hashes = dataset.task_hashes.size
         raise DataError(f"{where}: {hashes} task hashes for {len(dataset)} trajectories")
-    total = int(dataset.lengths.sum())
-    if len(dataset) == 0 or dataset.lengths.min() < 1:
+    if len(dataset) == 0 or lengths.min() < 1:
         raise DataError(f"{where}: every trajectory needs at least one step")
-    for name in Trajectory._fields[:-1]:
-        array = getattr(dataset, name)
-        if array.ndim == 0 or len(array) != total:
+    total = int(lengths.sum())
+    for name, array in dataset.arrays.items():
+        by_trajectory = name in ("lengths", "task_hashes", "last_obs")
+        if array.ndim == 0 or len(array) != (len(dataset) if by_trajectory else total):
             raise DataError(
-                f"{where}: {name} has shape {list(array.shape)}, the lengths add up to {total} steps"
+                f"{where}: {name} has shape {list(array.shape)}, the lengths add up to {total} steps "
+                f"of {len(dataset)} trajectories"
             )
         if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
-            step = int(np.argwhere(~np.isfinite(array))[0][0])
-            raise DataError(f"{where}: {name} holds NaN or infinity, first at step {step}")
-    if spec is None:
-        return
+            row = int(np.argwhere(~np.isfinite(array))[0][0])
+            of = "trajectory" if by_trajectory else "step"
+            raise DataError(f"{where}: {name} holds NaN or infinity, first at {of} {row}")
+    if spec is not None:
+        _check_fit(dataset, where, spec)
+
+
+def _check_fit(dataset: Dataset, where: Path | str, spec: EnvSpec) -> None:
+    """Raise ``DataError`` if a dataset cannot be of a world."""
+    obs: Any = np.floating if spec.obs.is_float else np.dtype(spec.obs.dtype)
     expected: dict[str, tuple[tuple[int, ...], Any]] = {
-        "obs": ((spec.obs_dim,), np.floating),
+        "obs": (spec.obs.shape, obs),
+        "last_obs": (spec.obs.shape, obs),
         "actions": ((), np.integer) if spec.discrete else ((spec.action_dim,), np.floating),
-        "goals": ((spec.goal_dim,), np.floating),
+        "achieved_goals": ((spec.goal_dim,), np.floating),
         "goal_reached": ((), np.bool_),
         "outcomes": ((spec.goal_dim,), np.floating),
+        "rewards": ((), np.floating),
     }
     for name, (shape, kind) in expected.items():
-        array = getattr(dataset, name)
+        if name not in dataset.arrays:
+            continue
+        array = dataset.arrays[name]
         if array.shape[1:] != shape or not np.issubdtype(array.dtype, kind):
             raise DataError(
                 f"{where}: {name} is {array.dtype}{list(array.shape[1:])} a step, "
-                f"{spec.name} needs {kind.__name__}{list(shape)}"
+                f"{spec.name} needs {getattr(kind, '__name__', kind)}{list(shape)}"
             )
     if spec.discrete and not (
         0 <= dataset.actions.min() <= dataset.actions.max() < spec.action_dim
@@ -172,7 +193,8 @@ def check_dataset(dataset: Dataset, where: Path | str, spec: EnvSpec | None = No
 
 
 class BatchPlan(NamedTuple):
-    """One part of a batch: which trajectories, cut at which length, padded to how many steps."""
+    """One part of a batch (a microbatch): which trajectories, cut at which length, padded to how many
+    steps."""
 
     indices: np.ndarray
     lengths: np.ndarray

@@ -1,7 +1,7 @@
 """Action distributions: what a policy returns and training scores, behind one interface.
 
 A policy head puts out ``head.num_params(action_dim)`` numbers; ``head.make(params)`` turns them into
-a distribution with ``log_prob``, ``sample`` and ``mode``.
+a distribution with ``log_prob``, ``sample``, ``mode``, ``explore`` and ``tempered``.
 """
 
 from __future__ import annotations
@@ -11,9 +11,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
-
-from mgpo_jax.types import PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 
 @runtime_checkable
@@ -27,7 +25,12 @@ class Distribution(Protocol):
     def mode(self) -> Array: ...
 
     def explore(self, key: PRNGKeyArray) -> Array:
-        """An action for episodes that search: a sample, where the head cannot tell intention from noise."""
+        """An action for episodes that search. It is a sample, except that a mixture leaves out the noise
+        of its components."""
+        ...
+
+    def tempered(self, temperature: Float[Array, ""]) -> Distribution:
+        """The distribution whose density is this one's to the power of 1 / temperature, normalized."""
         ...
 
 
@@ -49,6 +52,9 @@ class Categorical(NamedTuple):
 
     def explore(self, key: PRNGKeyArray) -> Int[Array, "*batch"]:
         return self.sample(key)
+
+    def tempered(self, temperature: Float[Array, ""]) -> Categorical:
+        return Categorical(self.logits / temperature)
 
 
 class Gaussian(NamedTuple):
@@ -73,6 +79,9 @@ class Gaussian(NamedTuple):
 
     def explore(self, key: PRNGKeyArray) -> Float[Array, "*batch A"]:
         return self.sample(key)
+
+    def tempered(self, temperature: Float[Array, ""]) -> Gaussian:
+        return Gaussian(self.mean, self.log_std + 0.5 * jnp.log(temperature))
 
 
 class Mixture(NamedTuple):
@@ -101,6 +110,13 @@ class Mixture(NamedTuple):
     def explore(self, key: PRNGKeyArray) -> Float[Array, "*batch A"]:
         """The mean of a random component: their spread is the demonstrator's noise, not its intention."""
         return self._component(jax.random.categorical(key, self.logits)).mode()
+
+    def tempered(self, temperature: Float[Array, ""]) -> Mixture:
+        """Exact where the components do not overlap: weights and components are tempered separately."""
+        log_std = self.log_std + 0.5 * jnp.log(temperature)
+        # The integral of a component's density to the power of 1 / temperature.
+        volume = (1 - 1 / temperature) * self.log_std.sum(axis=-1)
+        return Mixture(self.logits / temperature + volume, self.mean, log_std)
 
     def _component(self, which: Int[Array, "*batch"]) -> Gaussian:
         index = which[..., None, None]
@@ -141,6 +157,9 @@ class Binned(NamedTuple):
 
     def explore(self, key: PRNGKeyArray) -> Float[Array, "*batch A"]:
         return self.sample(key)
+
+    def tempered(self, temperature: Float[Array, ""]) -> Binned:
+        return Binned(self.logits / temperature)
 
 
 class Head(NamedTuple):

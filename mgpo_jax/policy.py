@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from mgpo_jax.transformer import GoalTransformer, TransformerConfig, grow_cache
 
 
 class Policy(NamedTuple):
-    """Acts step by step from a prompt; both functions are for one episode and are pure."""
+    """Acts step by step from a prompt; the functions are for one episode and are pure."""
 
     prefill: Callable
     """``(prompt, obs) -> (action distribution, carry)`` at the first observation."""
@@ -18,7 +19,24 @@ class Policy(NamedTuple):
     grow: Callable
     """``(carry, num_steps) -> carry`` with room for that many more decodes."""
     num_slots: int
-    """P: slots of the prompts it takes, its longest prompt."""
+    """P, the number of slots of the prompts that it takes: its longest prompt."""
+
+
+class LoadedPolicy(NamedTuple):
+    """A network, its weights and how it was made."""
+
+    config: TransformerConfig
+    params: Any
+    made: dict[str, Any]
+    sha256: str = ""
+    """Of the file of weights; empty for weights that were never on disk."""
+    folder: Path | None = None
+    """Where it was read."""
+
+    @property
+    def policy(self) -> Policy:
+        """The network as functions that act."""
+        return transformer_policy(self.config, self.params)
 
 
 def transformer_policy(config: TransformerConfig, params: Any) -> Policy:

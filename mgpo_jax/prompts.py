@@ -7,11 +7,23 @@ uniform in 1..K and clipped to the goals available, as in the authors' code.
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from mgpo_jax.types import PRNGKeyArray, Prompt, Trajectory
+from envs.base import Goals, Trajectory
+from envs.errors import UsageError
+
+
+class Prompt(NamedTuple):
+    """A sequence of up to P goals, right-aligned: the last slot always holds the final goal."""
+
+    goals: Float[Array, "*batch P G"]
+    mask: Bool[Array, "*batch P"]
+    """Which slots hold a goal; the others are zero."""
 
 
 def single_goal(goal: Float[Array, "G"], num_slots: int) -> Prompt:
@@ -20,26 +32,50 @@ def single_goal(goal: Float[Array, "G"], num_slots: int) -> Prompt:
     return Prompt(goals, jnp.arange(num_slots) == num_slots - 1)
 
 
-def hindsight_outcome(trajectory: Trajectory) -> Float[Array, "G"]:
+def prompt_of(goals: Any, num_slots: int) -> Prompt:
+    """The prompt of a sequence of goals; the last is usually the task goal g^M.
+
+    Raises:
+      UsageError: if there are no goals, more than ``num_slots``, or numbers that are not finite.
+    """
+    rows = np.asarray(goals, np.float32)
+    if rows.ndim != 2 or not 1 <= len(rows) <= num_slots:
+        raise UsageError(
+            f"a prompt is a list of 1 to {num_slots} goals, an array [k, G]; found shape "
+            f"{list(rows.shape)}"
+        )
+    if not np.isfinite(rows).all():
+        raise UsageError("the goals of a prompt must be finite numbers")
+    empty = num_slots - len(rows)
+    padded = np.concatenate([np.zeros((empty, rows.shape[1]), np.float32), rows])
+    return Prompt(jnp.asarray(padded), jnp.arange(num_slots) >= empty)
+
+
+def goals_of(prompt: Prompt) -> np.ndarray:
+    """The goals of one prompt, ``[k, G]``."""
+    return np.asarray(prompt.goals)[np.asarray(prompt.mask)]
+
+
+def hindsight_outcome(trajectory: Trajectory | Goals) -> Float[Array, "G"]:
     """g_H: the task goal that the trajectory reached, read at its last real step."""
     return trajectory.outcomes[trajectory.length - 1]
 
 
-def until_reached(trajectory: Trajectory, goal: Float[Array, "G"]) -> Trajectory:
-    """The trajectory up to the first step whose outcome is ``goal``; all of it if there is none.
+def until_reached(goals: Goals, goal: Float[Array, "G"]) -> Goals:
+    """The goals up to the first step whose outcome is ``goal``; all of them if there is no such step.
 
-    Some episodes go on after that: objects switched on in a wrong order leave the task unsolved, and
-    what is done then is on the way to nothing.
+    An episode can go on after that step, for example when objects were switched on in a wrong order and
+    the task is therefore not solved. What the agent does then does not help to solve it.
     """
-    reached = jnp.all(trajectory.outcomes == goal, axis=-1)
-    reached &= jnp.arange(len(reached)) < trajectory.length
-    length = jnp.where(jnp.any(reached), 1 + jnp.argmax(reached), trajectory.length)
-    return trajectory._replace(length=length.astype(trajectory.length.dtype))
+    reached = jnp.all(goals.outcomes == goal, axis=-1)
+    reached &= jnp.arange(len(reached)) < goals.length
+    length = jnp.where(jnp.any(reached), 1 + jnp.argmax(reached), goals.length)
+    return goals._replace(length=length.astype(goals.length.dtype))
 
 
 def sample_prompt(
     key: PRNGKeyArray,
-    trajectory: Trajectory,
+    trajectory: Trajectory | Goals,
     final_goal: Float[Array, "G"],
     num_slots: int,
     max_goals: int | Int[Array, ""] | None = None,
@@ -49,24 +85,25 @@ def sample_prompt(
 
     Args:
       key: random key.
-      trajectory: where the goals come from; only reached goals before its end are candidates.
+      trajectory: where the goals come from. Candidates are the goals that were reached before its end.
       final_goal: last goal of the prompt; in hindsight ``hindsight_outcome(trajectory)``, in
         adaptation the task goal g^M.
       num_slots: P, the number of slots of the returned prompt (static).
       max_goals: K <= P, the largest number of goals with the final one (traced; default P).
-      kept: steps whose goals are in every prompt, as far as there is room; the number of goals is
-        then uniform between those kept and those there are, and goals reached after the last kept
-        step come in any order (not in the paper; default none).
+      kept: steps whose goals are in every prompt, as far as there is room. The number of goals is then
+        uniform between the number of kept goals and the number of candidates, and goals reached after
+        the last kept step come in a random order (not in the paper; default: no step is kept).
 
     Returns:
-      A right-aligned prompt; goals keep the order in which the trajectory reached them, but for ``kept``.
+      A right-aligned prompt. Its goals are in the order in which the trajectory reached them, except
+      those that ``kept`` leaves in a random order.
     """
     key_count, key_index = jax.random.split(key)
     num_steps = trajectory.goal_reached.shape[0]
     time = jnp.arange(num_steps)
     # The step that reaches the final goal would only repeat it.
     repeats_end = (time == trajectory.length - 1) & jnp.all(
-        trajectory.goals == trajectory.outcomes, axis=-1
+        trajectory.achieved_goals == trajectory.outcomes, axis=-1
     )
     eligible = trajectory.goal_reached & (time < trajectory.length) & ~repeats_end
 
@@ -94,6 +131,10 @@ def sample_prompt(
     empty = num_slots - 1 - num_drawn
     mask = jnp.concatenate([jnp.zeros(empty, bool), used, jnp.ones(1, bool)])
     goals = jnp.concatenate(
-        [jnp.zeros((empty, final_goal.shape[0])), trajectory.goals[drawn], final_goal[None]]
+        [
+            jnp.zeros((empty, final_goal.shape[0])),
+            trajectory.achieved_goals[drawn],
+            final_goal[None],
+        ]
     )
     return Prompt(jnp.where(mask[:, None], goals, 0.0), mask)

@@ -1,7 +1,8 @@
-"""Spreading work over devices: trajectories in pre-training, tasks and seeds in adaptation.
+"""Spreading work over devices and fetching results: nothing else in the project does either.
 
-One mesh with one axis serves both. On a CPU the devices are the cores (``experiments.runtime`` asks
-XLA for one device a core: small programs on one core each waste less than one program on all).
+One mesh with one axis serves pre-training, where trajectories are divided, and adaptation, where tasks
+and seeds are. On a CPU the devices are the cores (``experiments.runtime`` asks XLA for one device a core,
+because small programs on one core each waste less than one program on all).
 """
 
 from __future__ import annotations
@@ -29,6 +30,32 @@ def split(mesh: Mesh, tree: Any) -> Any:
 def replicate(mesh: Mesh, tree: Any) -> Any:
     """Put a copy of every array on each device."""
     return jax.device_put(tree, NamedSharding(mesh, PartitionSpec()))
+
+
+def fetch(tree: Any) -> Any:
+    """Arrays of devices as numpy arrays; random keys become their raw data."""
+
+    def raw(leaf: Any) -> Any:
+        return jax.random.key_data(leaf) if is_key(leaf) else leaf
+
+    return jax.device_get(jax.tree.map(raw, tree))
+
+
+def is_key(leaf: Any) -> bool:
+    """Whether an array holds random keys."""
+    return isinstance(leaf, jax.Array) and jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def gather_rows(mesh: Mesh, tree: Any) -> list[Any]:
+    """The rows of arrays that have one row on each device, brought to the first device.
+
+    They travel by plain copies: a collective can deadlock on the small thread pool of a CPU.
+    """
+    home = mesh.devices.flat[0]
+    return [
+        jax.tree.map(lambda leaf, i=i: jax.device_put(leaf.addressable_shards[i].data, home), tree)
+        for i in range(mesh.devices.size)
+    ]
 
 
 def largest_divisor(number: int, limit: int) -> int:

@@ -15,15 +15,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
+from envs.base import EnvSpec
+from envs.errors import nearest
 from mgpo_jax.distributions import HEADS, Distribution
-from mgpo_jax.types import Prompt
+from mgpo_jax.encoders import ENCODERS
+from mgpo_jax.prompts import Prompt
 
 # Attention over the keys of one query block at a time: never the full score matrix.
 QUERY_BLOCK = 128
@@ -34,11 +37,18 @@ OBS_LIMIT = 5.0  # standard deviations; an observation farther out counts as thi
 class TransformerConfig:
     """Sizes of the network. Defaults are Table 6 of the paper."""
 
-    obs_dim: int
+    obs_shape: tuple[int, ...]
+    """Shape of an observation."""
     goal_dim: int
+    """Size G of a goal."""
     action_dim: int
+    """Number of discrete actions, or size A of a continuous action."""
     horizon: int
     """Largest number of steps T of an episode."""
+    obs_dtype: str = "float32"
+    """Dtype of an observation."""
+    encoder: str = "linear"
+    """How observations become tokens, one of ``encoders.ENCODERS``."""
     head: str = "categorical"
     """The action distribution, one of ``distributions.HEADS``."""
     max_prompt_length: int = 5
@@ -51,8 +61,33 @@ class TransformerConfig:
     prompt_order: bool = True
     """Whether prompt slots carry a position embedding (the paper's network: False)."""
     obs_mean: tuple[float, ...] = ()
-    """Of the observations in training, size D, where they are standardized (empty: they are not)."""
+    """Mean of every component of an observation in training, in the order of the flattened observation,
+    where observations are standardized (empty: they are not)."""
     obs_std: tuple[float, ...] = ()
+    """Standard deviation of every component, likewise."""
+
+
+def network_config(spec: EnvSpec, head: str | None = None, **sizes: Any) -> TransformerConfig:
+    """The network for a world, with Table 6's sizes unless given others.
+
+    Raises:
+      UsageError: if there is no such head or encoder, or the head is not one for the world's actions.
+    """
+    known = [name for name in HEADS if (name == "categorical") == spec.discrete]
+    head = head or known[0]
+    if head not in known:
+        raise nearest(head, known, f"head for {spec.name}")
+    if sizes.get("encoder", "linear") not in ENCODERS:
+        raise nearest(sizes["encoder"], ENCODERS, "encoder")
+    return TransformerConfig(
+        obs_shape=spec.obs.shape,
+        obs_dtype=spec.obs.dtype,
+        goal_dim=spec.goal_dim,
+        action_dim=spec.action_dim,
+        horizon=spec.horizon,
+        head=head,
+        **sizes,
+    )
 
 
 class KVCache(NamedTuple):
@@ -65,7 +100,7 @@ class KVCache(NamedTuple):
 
 
 def grow_cache(cache: KVCache, num_tokens: int) -> KVCache:
-    """The same cache with room for ``num_tokens`` more; its cost is that of its room."""
+    """The same cache with room for ``num_tokens`` more. The cost of attention grows with that room."""
     pad = ((0, 0), (0, num_tokens), (0, 0))
     keys, values = jax.tree.map(lambda rows: jnp.pad(rows, pad), (cache.keys, cache.values))
     return cache._replace(keys=keys, values=values)
@@ -144,7 +179,7 @@ class GoalTransformer(nn.Module):
         config = self.config
         small = nn.initializers.normal(0.02)
         self.embed_goal = nn.Dense(config.embed_dim)
-        self.embed_obs = nn.Dense(config.embed_dim)
+        self.embed_obs = ENCODERS[config.encoder](config.obs_shape, config.embed_dim)
         self.embed_action = nn.Dense(config.embed_dim)
         self.embed_time = self.param("embed_time", small, (config.horizon, config.embed_dim))
         if config.prompt_order:
@@ -159,7 +194,7 @@ class GoalTransformer(nn.Module):
     def __call__(
         self,
         prompt: Prompt,
-        obs: Float[Array, "T D"],
+        obs: Shaped[Array, "T ..."],
         actions: Array,
         deterministic: bool = True,
     ) -> Distribution:
@@ -200,7 +235,7 @@ class GoalTransformer(nn.Module):
             x = block(x, rows, attend, deterministic)
         return self._read_out(x)
 
-    def prefill(self, prompt: Prompt, obs: Float[Array, "D"]) -> tuple[Distribution, KVCache]:
+    def prefill(self, prompt: Prompt, obs: Shaped[Array, "..."]) -> tuple[Distribution, KVCache]:
         """Read the prompt and the first observation; returns pi(a_1) and the cache."""
         config = self.config
         first = self._obs_token(obs[None], self.embed_time[:1])
@@ -211,7 +246,7 @@ class GoalTransformer(nn.Module):
         return self._extend(x, grow_cache(cache, len(x)), at=0)
 
     def decode(
-        self, cache: KVCache, action: Array, obs: Float[Array, "D"]
+        self, cache: KVCache, action: Array, obs: Shaped[Array, "..."]
     ) -> tuple[Distribution, KVCache]:
         """Append (a_{t-1}, o_t); returns pi(a_t) and the longer cache.
 
@@ -259,10 +294,14 @@ class GoalTransformer(nn.Module):
         tokens = self.embed_goal(prompt.goals)
         return tokens + self.embed_slot if self.config.prompt_order else tokens
 
-    def _obs_token(self, obs: Float[Array, "T D"], time: Array) -> Float[Array, "T E"]:
-        if self.config.obs_mean:
-            obs = (obs - jnp.array(self.config.obs_mean)) / jnp.array(self.config.obs_std)
-            obs = jnp.clip(obs, -OBS_LIMIT, OBS_LIMIT)
+    def _obs_token(self, obs: Shaped[Array, "T ..."], time: Array) -> Float[Array, "T E"]:
+        config = self.config
+        if config.obs_mean:
+            mean, std = (
+                jnp.array(row).reshape(config.obs_shape)
+                for row in (config.obs_mean, config.obs_std)
+            )
+            obs = jnp.clip((obs - mean) / std, -OBS_LIMIT, OBS_LIMIT)
         return self.embed_obs(obs) + time
 
     def _action_token(self, actions: Array, time: Array) -> Float[Array, "T E"]:

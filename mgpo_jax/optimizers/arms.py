@@ -25,11 +25,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from envs.base import Episode, Goals
 from mgpo_jax.optimizers.base import PromptOptimizer, SearchSpace, choose
-from mgpo_jax.prompts import sample_prompt, single_goal, until_reached
-from mgpo_jax.types import Episode, PRNGKeyArray, Prompt, Query, Trajectory
+from mgpo_jax.prompts import Prompt, sample_prompt, single_goal, until_reached
+from mgpo_jax.rollout import Query
 
 MAX_ARMS = 64
 SHRINKAGE = 2.0
@@ -65,7 +66,25 @@ def empty_arms(num_arms: int, num_slots: int, goal_dim: int) -> Arms:
         jnp.zeros((num_arms, num_slots, goal_dim)), jnp.zeros((num_arms, num_slots), bool)
     )
     zeros = jnp.zeros(num_arms)
-    return Arms(prompts, zeros, zeros, zeros, jnp.full(num_arms, -jnp.inf), jnp.int32(0))
+    return Arms(
+        prompts=prompts,
+        pulls=zeros,
+        mean=zeros,
+        sum_sq=zeros,
+        entry_return=jnp.full(num_arms, -jnp.inf),
+        size=jnp.int32(0),
+    )
+
+
+def no_goals(horizon: int, goal_dim: int) -> Goals:
+    """The goals of an episode without steps."""
+    nothing = jnp.zeros((horizon, goal_dim))
+    return Goals(
+        achieved_goals=nothing,
+        goal_reached=jnp.zeros(horizon, bool),
+        outcomes=nothing,
+        length=jnp.int32(0),
+    )
 
 
 def insert_arm(arms: Arms, prompt: Prompt, return_: Float[Array, ""]) -> Arms:
@@ -122,8 +141,8 @@ class BanditState(NamedTuple):
     """The prompt last drawn from the best trajectory."""
     best_return: Float[Array, ""]
     """R*."""
-    best_trajectory: Trajectory
-    """tau*; blank before the first episode."""
+    best_goals: Goals
+    """The goals of tau*, the best trajectory so far; none before the first episode."""
     confirmed: Bool[Array, "T"]
     """Steps of tau* that reached a goal and were rewarded."""
 
@@ -138,13 +157,19 @@ def bandit(space: SearchSpace, select: Select, act_with_newest: bool = False) ->
     """
     num_arms = min(MAX_ARMS, 1 + space.num_episodes // 2)
 
-    def init(key: PRNGKeyArray, task_goal: Float[Array, "G"], blank: Trajectory) -> BanditState:
+    def init(key: PRNGKeyArray, task_goal: Float[Array, "G"]) -> BanditState:
         del key
-        arms = empty_arms(num_arms, space.num_slots, task_goal.shape[-1])
-        first = single_goal(task_goal, space.num_slots)
-        zero = jnp.int32(0)
-        none = jnp.zeros_like(blank.goal_reached)
-        return BanditState(task_goal, arms, zero, zero, first, jnp.float32(-jnp.inf), blank, none)
+        goal_dim = task_goal.shape[-1]
+        return BanditState(
+            task_goal=task_goal,
+            arms=empty_arms(num_arms, space.num_slots, goal_dim),
+            episode=jnp.int32(0),
+            arm=jnp.int32(0),
+            newest=single_goal(task_goal, space.num_slots),
+            best_return=jnp.float32(-jnp.inf),
+            best_goals=no_goals(space.horizon, goal_dim),
+            confirmed=jnp.zeros(space.horizon, bool),
+        )
 
     def ask(key: PRNGKeyArray, state: BanditState) -> tuple[Query, BanditState]:
         key_select, key_prompt = jax.random.split(key)
@@ -153,7 +178,7 @@ def bandit(space: SearchSpace, select: Select, act_with_newest: bool = False) ->
         chosen = state.newest if act_with_newest else state.arms.prompt(arm)
         drawn = sample_prompt(
             key_prompt,
-            state.best_trajectory,
+            state.best_goals,
             state.task_goal,
             space.num_slots,
             space.max_goals,
@@ -162,7 +187,7 @@ def bandit(space: SearchSpace, select: Select, act_with_newest: bool = False) ->
         keeps = acts | (state.episode == 0)
         newest = choose(keeps, state.newest, drawn)
         prompt = choose(acts, chosen, newest)
-        # Of a world of chance a greedy episode is no exact measure either, and explores less.
+        # Greedy returns are noisy in stochastic worlds; there new prompts are tried by sampling.
         greedy = (state.episode == 0) | (~acts & space.deterministic)
         return Query(prompt, greedy), state._replace(arm=arm, newest=newest)
 
@@ -179,8 +204,10 @@ def bandit(space: SearchSpace, select: Select, act_with_newest: bool = False) ->
             arms=choose(inserts, inserted, choose(sampled, updated, state.arms)),
             episode=state.episode + 1,
             best_return=jnp.maximum(return_, state.best_return),
-            best_trajectory=choose(
-                improves, until_reached(episode.trajectory, state.task_goal), state.best_trajectory
+            best_goals=choose(
+                improves,
+                until_reached(episode.trajectory.goals, state.task_goal),
+                state.best_goals,
             ),
             confirmed=jnp.where(
                 improves, episode.trajectory.goal_reached & (episode.rewards > 0), state.confirmed
@@ -188,6 +215,8 @@ def bandit(space: SearchSpace, select: Select, act_with_newest: bool = False) ->
         )
 
     def best(state: BanditState) -> Prompt:
-        return state.arms.prompt(jnp.argmax(estimated_returns(state.arms, space.deterministic)))
+        best_arm = jnp.argmax(estimated_returns(state.arms, space.deterministic))
+        # Before the first episode there are no arms, and the newest prompt is (g^M).
+        return choose(state.arms.size == 0, state.newest, state.arms.prompt(best_arm))
 
     return PromptOptimizer(init, ask, tell, best)

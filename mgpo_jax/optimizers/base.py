@@ -1,8 +1,8 @@
 """The interface of prompt optimizers: pure functions over an explicit state, one episode at a time.
 
 ``ask`` names the prompt of the next episode and ``tell`` takes its result, so every method is charged
-for every episode it uses, the first evaluation of the prompt (g^M) included. A factory closes over
-hyper-parameters, which may be traced: a sweep is a ``vmap`` over a factory's arguments.
+for every episode that it uses, the first evaluation of the prompt (g^M) included. A factory such as
+``ucb(space, c)`` closes over the hyper-parameters, which may be traced: a sweep is a ``vmap`` over them.
 """
 
 from __future__ import annotations
@@ -13,46 +13,50 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from mgpo_jax.types import PRNGKeyArray
+from envs.base import Episode
+from mgpo_jax.prompts import Prompt
+from mgpo_jax.rollout import Query
 
 
 class PromptOptimizer(NamedTuple):
     """Searches a prompt for one task; ``jax.vmap`` searches for many."""
 
-    init: Callable
-    """``(key, task_goal, blank) -> state``, with a blank trajectory of the world for its shapes."""
-    ask: Callable
+    init: Callable[[PRNGKeyArray, Float[Array, "G"]], Any]
+    """``(key, task_goal) -> state``."""
+    ask: Callable[[PRNGKeyArray, Any], tuple[Query, Any]]
     """``(key, state) -> (query, state)``: what to run in the next episode."""
-    tell: Callable
+    tell: Callable[[Any, Query, Episode], Any]
     """``(state, query, episode) -> state``."""
-    best: Callable
+    best: Callable[[Any], Prompt]
     """``(state) -> prompt``: the best prompt so far."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SearchSpace:
     """What an optimizer may know of the world and of the policy, beside the task goal."""
 
     num_slots: int
-    """P, slots of a prompt."""
-    sample_goal: Callable[[PRNGKeyArray], Float[Array, "G"]]
-    """Draws a goal that may stand in a prompt (GRIPS)."""
+    """P, the number of slots of a prompt."""
+    horizon: int
+    """T, the largest number of steps of an episode."""
     return_range: tuple[float, float]
     """Smallest and largest possible return."""
     num_episodes: int
-    """Budget N; sizes tables, does not stop the search."""
-    max_goals: int | Int[Array, ""] | Any = None
-    """K, the longest prompt to try; None means ``num_slots``."""
+    """The budget N. It sizes tables; it does not stop the search."""
+    sample_goal: Callable[[PRNGKeyArray], Float[Array, "G"]]
+    """Draws a goal that may stand in a prompt, for methods that insert random goals."""
+    max_goals: int | Int[Array, ""] | None = None
+    """K, the number of goals of the longest prompt to try (None: ``num_slots``)."""
     deterministic: bool = True
     """Whether a prompt's greedy episode always has the same return."""
     keep_rewarded: bool = False
-    """Whether prompts drawn from a trajectory keep the goals that were rewarded, and shuffle those that
-    were reached afterwards (bandits)."""
+    """Whether prompts drawn from a trajectory keep the goals that were rewarded, and put those that were
+    reached after them in a random order."""
 
     @property
-    def longest(self) -> int | Int[Array, ""] | Any:
+    def longest(self) -> int | Int[Array, ""]:
         return self.num_slots if self.max_goals is None else self.max_goals
 
     @property

@@ -11,11 +11,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from envs.base import Episode
 from mgpo_jax.optimizers.base import PromptOptimizer, SearchSpace, choose
-from mgpo_jax.prompts import sample_prompt, single_goal
-from mgpo_jax.types import Episode, PRNGKeyArray, Prompt, Query, Trajectory
+from mgpo_jax.prompts import Prompt, sample_prompt, single_goal
+from mgpo_jax.rollout import Query
 
 
 def rank_weights(population: Any, fitness: Float[Array, "L"], state: Any, params: Any) -> Any:
@@ -65,8 +66,7 @@ def bbt(
         cma = CMA_ES(population_size, jnp.zeros(latent_dim), fitness_shaping_fn=rank_weights)
         return cma, cma.default_params.replace(std_init=jnp.asarray(std_init, jnp.float32))
 
-    def init(key: PRNGKeyArray, task_goal: Float[Array, "G"], blank: Trajectory) -> BbtState:
-        del blank
+    def init(key: PRNGKeyArray, task_goal: Float[Array, "G"]) -> BbtState:
         cma, params = strategy()
         first = single_goal(task_goal, space.num_slots)
         key_projection, key_cma, key_start = jax.random.split(key, 3)
@@ -74,13 +74,17 @@ def bbt(
         projection = jax.random.normal(key_projection, shape) / latent_dim**0.5
         state = jax.tree.map(jnp.asarray, cma.init(key_cma, jnp.zeros(latent_dim), params))
         return BbtState(
-            task_goal, first, key_start, projection, state,
+            task_goal=task_goal,
+            start=first,
+            start_key=key_start,
+            projection=projection,
+            cma=state,
             population=jnp.zeros((population_size, latent_dim)),
             returns=jnp.zeros(population_size),
             best_prompt=first,
             best_return=jnp.float32(-jnp.inf),
             episode=jnp.int32(0),
-        )  # fmt: skip
+        )
 
     def place(state: BbtState) -> Int[Array, ""]:
         """Which member of the population the next episode evaluates."""

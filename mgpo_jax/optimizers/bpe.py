@@ -9,11 +9,10 @@ underflows (in the authors' code 1 - cdf does, all arms tie and the first one wi
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from mgpo_jax.optimizers.arms import Arms, BanditState, bandit
 from mgpo_jax.optimizers.base import PromptOptimizer, SearchSpace
-from mgpo_jax.types import PRNGKeyArray
 
 
 def posterior(

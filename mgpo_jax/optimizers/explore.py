@@ -6,11 +6,10 @@ Acts with the prompt most recently drawn from the best trajectory, whatever its 
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array, Int, PRNGKeyArray
 
 from mgpo_jax.optimizers.arms import BanditState, bandit
 from mgpo_jax.optimizers.base import PromptOptimizer, SearchSpace
-from mgpo_jax.types import PRNGKeyArray
 
 
 def explore(space: SearchSpace) -> PromptOptimizer:

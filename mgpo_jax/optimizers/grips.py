@@ -6,11 +6,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from envs.base import Episode
 from mgpo_jax.optimizers.base import PromptOptimizer, SearchSpace, choose
-from mgpo_jax.prompts import single_goal
-from mgpo_jax.types import Episode, PRNGKeyArray, Prompt, Query, Trajectory
+from mgpo_jax.prompts import Prompt, single_goal
+from mgpo_jax.rollout import Query
 
 ADD, DELETE, SWAP = range(3)
 
@@ -75,11 +76,13 @@ def grips(space: SearchSpace, num_edits: int = 5) -> PromptOptimizer:
     may be better, and the search would never leave it.
     """
 
-    def init(key: PRNGKeyArray, task_goal: Float[Array, "G"], blank: Trajectory) -> GripsState:
-        del key, blank
+    def init(key: PRNGKeyArray, task_goal: Float[Array, "G"]) -> GripsState:
+        del key
         first = single_goal(task_goal, space.num_slots)
         worst = jnp.float32(-jnp.inf)
-        return GripsState(first, worst, first, worst, jnp.int32(0))
+        return GripsState(
+            prompt=first, return_=worst, leader=first, leader_return=worst, episode=jnp.int32(0)
+        )
 
     def ask(key: PRNGKeyArray, state: GripsState) -> tuple[Query, GripsState]:
         key_goal, key_edit = jax.random.split(key)

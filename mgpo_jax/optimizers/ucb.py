@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from mgpo_jax.optimizers.arms import Arms, BanditState, bandit
 from mgpo_jax.optimizers.base import PromptOptimizer, SearchSpace
-from mgpo_jax.types import PRNGKeyArray
 
 
 def upper_confidence_bounds(

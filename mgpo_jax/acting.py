@@ -1,0 +1,106 @@
+"""Acting step by step under a prompt, outside of any program: on a robot, or in a gymnasium loop."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.episodes import segment_length
+from envs.errors import UsageError
+from mgpo_jax.policy import LoadedPolicy
+from mgpo_jax.prompts import Prompt, prompt_of
+from mgpo_jax.rollout import Query, act
+
+
+class Actor:
+    """A policy that acts in a world which somebody else steps.
+
+    It remembers the episode, so observations are given one at a time and in order:
+
+        actor = Actor(load_policy("maze15"), goals)
+        action = actor.reset(obs)
+        while not done:
+            obs, done = step_the_world(action)
+            action = actor.act(obs)
+
+    Args:
+      policy: a loaded policy.
+      goals: the prompt, a ``Prompt`` or an array ``[k, G]`` of goals whose last is the task goal.
+      greedy: whether to act by the likeliest action instead of exploring.
+      seed: seed of the exploration.
+    """
+
+    def __init__(
+        self, policy: LoadedPolicy, goals: Prompt | Any, greedy: bool = True, seed: int = 0
+    ) -> None:
+        self.config = policy.config
+        self._functions = policy.policy
+        self._key = jax.random.key(seed)
+        self._greedy = jnp.asarray(greedy)
+        self._prefill = jax.jit(self._functions.prefill)
+        self._decode = jax.jit(self._functions.decode)
+        self._step = 0
+        self.prompt = goals
+
+    @property
+    def prompt(self) -> Prompt:
+        """The prompt of the next episode; it may be set to another one between two episodes."""
+        return self._prompt
+
+    @prompt.setter
+    def prompt(self, goals: Prompt | Any) -> None:
+        slots = self.config.max_prompt_length
+        prompt = goals if isinstance(goals, Prompt) else prompt_of(goals, slots)
+        if prompt.goals.shape != (slots, self.config.goal_dim):
+            raise UsageError(
+                f"the policy takes goals of {self.config.goal_dim} numbers, found a prompt of shape "
+                f"{list(prompt.goals.shape)}"
+            )
+        self._prompt = prompt
+
+    def reset(self, obs: Any) -> np.ndarray:
+        """The first action of a new episode."""
+        distribution, self._carry = self._prefill(self._prompt, self._checked(obs))
+        self._step, self._room = 1, 0
+        return self._choose(distribution)
+
+    def act(self, obs: Any) -> np.ndarray:
+        """The next action of the episode.
+
+        Raises:
+          UsageError: before ``reset``, for an observation of another shape or with NaN in it, or when the
+            episode is longer than the policy was trained for.
+        """
+        horizon = self.config.horizon
+        if not self._step:
+            raise UsageError("call reset with the first observation of the episode")
+        if self._step >= horizon:
+            raise UsageError(
+                f"the policy was trained for episodes of {horizon} steps; call reset to begin another"
+            )
+        if not self._room:
+            # As in the episode loop, room is made for some steps at a time: each size is compiled once.
+            self._room = min(segment_length(horizon), horizon - self._step)
+            self._carry = self._functions.grow(self._carry, self._room)
+        distribution, self._carry = self._decode(self._carry, self._action, self._checked(obs))
+        self._step, self._room = self._step + 1, self._room - 1
+        return self._choose(distribution)
+
+    def _choose(self, distribution: Any) -> np.ndarray:
+        self._key, key = jax.random.split(self._key)
+        self._action = act(key, distribution, Query(self._prompt, self._greedy))
+        return np.asarray(self._action)
+
+    def _checked(self, obs: Any) -> jax.Array:
+        array = np.asarray(obs)
+        if array.shape != self.config.obs_shape:
+            raise UsageError(
+                f"the policy takes observations of shape {list(self.config.obs_shape)}, found "
+                f"{list(array.shape)}"
+            )
+        if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
+            raise UsageError("the observation holds NaN or infinity")
+        return jnp.asarray(array, self.config.obs_dtype)

@@ -1,0 +1,276 @@
+"""The methods that adapt to a task, by name, with their hyper-parameters. Nothing here imports jax.
+
+A method is found under a name that it was registered with, under the name of an entry point in the group
+``mgpo_jax.methods``, or as ``module:attribute``.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import importlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from envs.errors import UsageError
+from envs.registry import Judgement, Registry
+from mgpo_jax.settings import check_settings, number
+
+if TYPE_CHECKING:
+    from envs.base import Environment
+    from mgpo_jax.adaptation import Adapter
+    from mgpo_jax.transformer import TransformerConfig
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What a method may know before it sees a task. Everything in it is static.
+
+    Attributes:
+      env: the world.
+      network: the network of the policy.
+      num_episodes: the budget of episodes for one task.
+      judged: how the world judges policies.
+    """
+
+    env: Environment
+    network: TransformerConfig
+    num_episodes: int
+    judged: Judgement
+
+
+@dataclass(frozen=True)
+class NoHyper:
+    """The hyper-parameters of a method that has none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Method:
+    """Everything that generic code needs to know of a method.
+
+    Attributes:
+      name: what ``--method`` calls it.
+      make: ``(setting, params, hyper) -> Adapter``, or its place as ``module:attribute``. It is called
+        while a program is traced: the weights ``params`` and the numbers in ``hyper`` are data, so
+        another policy of the same sizes, or a sweep over a hyper-parameter, compiles nothing.
+      hyper: the frozen dataclass of its hyper-parameters; flags, help and checks are made from it.
+      check: ``(setting, hyper) -> None``, or its place, raises ``UsageError`` where the method cannot be
+        used.
+      title: its name in tables and legends.
+      summary: what it is, in one line.
+    """
+
+    name: str
+    make: str | Callable[[Setting, Any, Any], Adapter]
+    hyper: type = NoHyper
+    check: str | Callable[[Setting, Any], None] | None = None
+    title: str = ""
+    summary: str = ""
+
+    def adapter(self, setting: Setting, params: Any, hyper: Any) -> Adapter:
+        """The adapter for one task; see ``make``."""
+        return load(self.make)(setting, params, hyper)
+
+    def check_use(self, setting: Setting, hyper: Any) -> None:
+        """Raise ``UsageError`` for hyper-parameters out of bounds or a setting that does not fit."""
+        if not isinstance(hyper, self.hyper):
+            raise UsageError(
+                f"{self.name} takes hyper-parameters as {self.hyper.__name__}, found "
+                f"{type(hyper).__name__}"
+            )
+        check_settings(hyper)
+        if self.check is not None:
+            load(self.check)(setting, hyper)
+
+    def hyper_from(self, values: Mapping[str, Any]) -> Any:
+        """The hyper-parameters with some values changed.
+
+        Raises:
+          UsageError: for a name that is none of this method's, with the methods that have it.
+        """
+        own = {field.name for field in dataclasses.fields(self.hyper)}
+        for name in values:
+            if name not in own:
+                raise foreign_setting(name, self)
+        return self.hyper(**values)
+
+
+def load(place: str | Callable) -> Callable:
+    """What ``module:attribute`` names; anything else as it is."""
+    if not isinstance(place, str):
+        return place
+    module, _, attribute = place.partition(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def foreign_setting(name: str, method: Method) -> UsageError:
+    """The error for a hyper-parameter that the method does not have, with the methods that do."""
+    others = [other for other in map(METHODS.find, names()) if other.name != method.name]
+    having = [
+        other.name
+        for other in others
+        if name in {field.name for field in dataclasses.fields(other.hyper)}
+    ]
+    hint = f"; it is one of {', '.join(having)}" if having else ""
+    return UsageError(f"--{name.replace('_', '-')} is no setting of {method.name}{hint}")
+
+
+def split_hyper(hypers: Sequence[Any]) -> tuple[Any, dict[str, list[float]]]:
+    """Hyper-parameters of several variants as one static record and the numbers that are data.
+
+    Raises:
+      UsageError: if the variants differ in a setting that decides about shapes.
+    """
+    first = hypers[0]
+    numbers: dict[str, list[float]] = {}
+    for field in dataclasses.fields(first):
+        values = [getattr(hyper, field.name) for hyper in hypers]
+        numeric = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
+        if numeric and not field.metadata.get("static"):
+            numbers[field.name] = values
+        elif any(value != values[0] for value in values):
+            raise UsageError(f"{field.name} cannot differ between the variants of one program")
+    return with_numbers(first, dict.fromkeys(numbers, 0)), numbers
+
+
+def with_numbers(hyper: Any, numbers: Mapping[str, Any]) -> Any:
+    """A copy of some hyper-parameters with other numbers, which may be traced arrays."""
+    changed = copy.copy(hyper)
+    for name, value in numbers.items():
+        object.__setattr__(changed, name, value)  # the record is frozen and its types are floats
+    return changed
+
+
+@dataclass(frozen=True)
+class PromptHyper:
+    """Hyper-parameters of every method that searches prompts. Values in brackets are the paper's."""
+
+    max_goals: int | None = number(None, at_least=1)
+    """K, the longest prompt to try (default: the longest that the policy was trained with) [5]."""
+
+
+@dataclass(frozen=True)
+class ExploreHyper(PromptHyper):
+    """Hyper-parameters of Algorithm 1 without a bandit."""
+
+    keep_rewarded: bool = True
+    """In worlds that reward a sequence part by part, new prompts keep the goals of the best trajectory
+    that were rewarded, and put those after them in a random order [False]."""
+
+
+@dataclass(frozen=True)
+class UcbHyper(ExploreHyper):
+    """Hyper-parameters of Algorithm 1 with upper confidence bounds (Eq. 3)."""
+
+    c: float = number(1.0, at_least=0)
+    """Exploration constant [1]."""
+    scale: float | None = number(None, above=0)
+    """Unit of returns in which c counts; 1 is Eq. 3 as printed (default: the span of the world's
+    returns)."""
+
+
+@dataclass(frozen=True)
+class BpeHyper(ExploreHyper):
+    """Hyper-parameters of Algorithm 1 with Bayesian posterior estimation (Eq. 4)."""
+
+    min_std: float = number(0.02, above=0)
+    """Smallest spread of a prompt's returns, as a share of the prior's."""
+
+
+@dataclass(frozen=True)
+class GripsHyper(PromptHyper):
+    """Hyper-parameters of Algorithm 2."""
+
+    num_edits: int = number(5, at_least=1)
+    """Edited prompts in an iteration [5]."""
+
+
+@dataclass(frozen=True)
+class BbtHyper(PromptHyper):
+    """Hyper-parameters of Algorithm 3."""
+
+    population_size: int = number(10, at_least=2, static=True)
+    """Population of CMA-ES [10]."""
+    latent_dim: int = number(5, at_least=1, static=True)
+    """Size of z."""
+    std_init: float = number(0.5, above=0)
+    """Initial step size, in units of goals."""
+
+
+_HERE = "mgpo_jax.optimizers.methods"
+METHODS: Registry[Method] = Registry(
+    "method",
+    Method,
+    "mgpo_jax.methods",
+    {
+        name: f"mgpo_jax.methods:{name.upper()}"
+        for name in ("ucb", "bpe", "explore", "grips", "bbt", "gcbc")
+    },
+)
+
+UCB = Method(
+    name="ucb",
+    title="MGPO-UCB",
+    summary="Algorithm 1; acts with the prompt of the highest upper confidence bound",
+    make=f"{_HERE}:make_ucb",
+    check=f"{_HERE}:check_prompts",
+    hyper=UcbHyper,
+)
+BPE = Method(
+    name="bpe",
+    title="MGPO-BPE",
+    summary="Algorithm 1; acts with the prompt most likely to beat the best return",
+    make=f"{_HERE}:make_bpe",
+    check=f"{_HERE}:check_prompts",
+    hyper=BpeHyper,
+)
+EXPLORE = Method(
+    name="explore",
+    title="MGPO-explore",
+    summary="Algorithm 1 without a bandit; acts with the newest prompt",
+    make=f"{_HERE}:make_explore",
+    check=f"{_HERE}:check_prompts",
+    hyper=ExploreHyper,
+)
+GRIPS = Method(
+    name="grips",
+    title="GRIPS",
+    summary="Algorithm 2; adds, deletes and swaps goals of the prompt",
+    make=f"{_HERE}:make_grips",
+    check=f"{_HERE}:check_grips",
+    hyper=GripsHyper,
+)
+BBT = Method(
+    name="bbt",
+    title="BBT",
+    summary="Algorithm 3; moves the goals of the prompt by CMA-ES",
+    make=f"{_HERE}:make_bbt",
+    check=f"{_HERE}:check_prompts",
+    hyper=BbtHyper,
+)
+GCBC = Method(
+    name="gcbc",
+    title="GC-BC",
+    summary="goal-conditioned behavior cloning; the prompt stays (g^M) in every episode",
+    make=f"{_HERE}:make_gcbc",
+)
+
+
+def register(method: Method) -> Method:
+    """Make a method known under its name; returns it."""
+    return METHODS.register(method)
+
+
+def names() -> list[str]:
+    """The names of all methods."""
+    return METHODS.names()
+
+
+def find(name: str) -> Method:
+    """The record of a method, by its name or as ``module:attribute``.
+
+    Raises:
+      UsageError: with the nearest name, for one that does not exist.
+    """
+    return METHODS.find(name)

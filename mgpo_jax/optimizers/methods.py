@@ -1,0 +1,158 @@
+"""Prompt optimizers as methods: how each is made from its hyper-parameters, and lifted into an adapter."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from envs.base import Agent, Episode
+from envs.errors import UsageError
+from envs.registry import Judgement
+from mgpo_jax.adaptation import Adapter
+from mgpo_jax.methods import (
+    BbtHyper,
+    BpeHyper,
+    ExploreHyper,
+    GripsHyper,
+    NoHyper,
+    PromptHyper,
+    Setting,
+    UcbHyper,
+)
+from mgpo_jax.optimizers.base import PromptOptimizer, SearchSpace
+from mgpo_jax.optimizers.bbt import bbt
+from mgpo_jax.optimizers.bpe import bpe
+from mgpo_jax.optimizers.explore import explore
+from mgpo_jax.optimizers.grips import grips
+from mgpo_jax.optimizers.ucb import ucb
+from mgpo_jax.policy import Policy, transformer_policy
+from mgpo_jax.prompts import Prompt, single_goal
+from mgpo_jax.rollout import Query, prompted
+
+
+def prompt_adapter(
+    policy: Policy, optimizer: PromptOptimizer, judged: Judgement | None = None
+) -> Adapter:
+    """A prompt optimizer as an adapter: its choices are prompts for a policy that never changes.
+
+    Args:
+      policy: who acts under the prompts.
+      optimizer: who searches them.
+      judged: how the best prompt is judged (default: greedily).
+    """
+    judged = judged or Judgement()
+    sampled = judged.mode == "sample"
+    tempered = sampled and judged.temperature != 1
+
+    def ask(key: PRNGKeyArray, state: Any) -> tuple[Query, Any]:
+        query, state = optimizer.ask(key, state)
+        return query._replace(temperature=jnp.ones(()) if tempered else None), state
+
+    def agent(state: Any, query: Query) -> Agent:
+        del state
+        return prompted(policy, query)
+
+    def tell(key: PRNGKeyArray, state: Any, query: Query, episodes: Episode) -> Any:
+        del key
+        return optimizer.tell(state, query, jax.tree.map(lambda leaf: leaf[0], episodes))
+
+    def best(state: Any) -> Query:
+        return judged_query(optimizer.best(state), judged)
+
+    return Adapter(init=optimizer.init, ask=ask, agent=agent, tell=tell, best=best)
+
+
+def judged_query(prompt: Prompt, judged: Judgement) -> Query:
+    """How a prompt is judged."""
+    sampled = judged.mode == "sample"
+    tempered = sampled and judged.temperature != 1
+    temperature = jnp.float32(judged.temperature) if tempered else None
+    return Query(prompt, jnp.full(prompt.mask.shape[:-1], not sampled), temperature)
+
+
+def fixed_prompt(num_slots: int) -> PromptOptimizer:
+    """Keeps the prompt (g^M) in all episodes: goal-conditioned behavior cloning."""
+
+    def init(key: PRNGKeyArray, task_goal: Float[Array, "G"]) -> Prompt:
+        del key
+        return single_goal(task_goal, num_slots)
+
+    def ask(key: PRNGKeyArray, state: Prompt) -> tuple[Query, Prompt]:
+        del key
+        return Query(state, jnp.ones((), bool)), state
+
+    return PromptOptimizer(
+        init=init,
+        ask=ask,
+        tell=lambda state, query, episode: state,
+        best=lambda state: state,
+    )
+
+
+def search_space(setting: Setting, hyper: PromptHyper) -> SearchSpace:
+    """What a prompt optimizer may know in a setting."""
+    spec = setting.env.spec
+    return SearchSpace(
+        num_slots=setting.network.max_prompt_length,
+        horizon=spec.horizon,
+        return_range=spec.return_range,
+        num_episodes=setting.num_episodes,
+        sample_goal=setting.env.sample_goal,
+        max_goals=hyper.max_goals,
+        deterministic=spec.deterministic,
+        keep_rewarded=getattr(hyper, "keep_rewarded", False) and spec.reward_confirms_goals,
+    )
+
+
+def make_ucb(setting: Setting, params: Any, hyper: UcbHyper) -> Adapter:
+    return _lifted(setting, params, ucb(search_space(setting, hyper), c=hyper.c, scale=hyper.scale))
+
+
+def make_bpe(setting: Setting, params: Any, hyper: BpeHyper) -> Adapter:
+    return _lifted(setting, params, bpe(search_space(setting, hyper), min_std=hyper.min_std))
+
+
+def make_explore(setting: Setting, params: Any, hyper: ExploreHyper) -> Adapter:
+    return _lifted(setting, params, explore(search_space(setting, hyper)))
+
+
+def make_grips(setting: Setting, params: Any, hyper: GripsHyper) -> Adapter:
+    return _lifted(setting, params, grips(search_space(setting, hyper), num_edits=hyper.num_edits))
+
+
+def make_bbt(setting: Setting, params: Any, hyper: BbtHyper) -> Adapter:
+    optimizer = bbt(
+        search_space(setting, hyper),
+        population_size=hyper.population_size,
+        latent_dim=hyper.latent_dim,
+        std_init=hyper.std_init,
+    )
+    return _lifted(setting, params, optimizer)
+
+
+def make_gcbc(setting: Setting, params: Any, hyper: NoHyper) -> Adapter:
+    del hyper
+    return _lifted(setting, params, fixed_prompt(setting.network.max_prompt_length))
+
+
+def _lifted(setting: Setting, params: Any, optimizer: PromptOptimizer) -> Adapter:
+    return prompt_adapter(transformer_policy(setting.network, params), optimizer, setting.judged)
+
+
+def check_prompts(setting: Setting, hyper: PromptHyper) -> None:
+    """Raise ``UsageError`` for prompts longer than the policy was trained with."""
+    longest = setting.network.max_prompt_length
+    if hyper.max_goals is not None and hyper.max_goals > longest:
+        raise UsageError(
+            f"--max-goals {hyper.max_goals} is longer than the policy's prompts ({longest} goals); "
+            "pre-train with --max-prompt-length"
+        )
+
+
+def check_grips(setting: Setting, hyper: GripsHyper) -> None:
+    """Raise ``UsageError`` where the world draws no goals that could be inserted into a prompt."""
+    check_prompts(setting, hyper)
+    jax.eval_shape(setting.env.sample_goal, jax.random.key(0))

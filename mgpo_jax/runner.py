@@ -1,0 +1,501 @@
+"""Runs many episodes and adaptations at once. Everything that commands and examples run goes through here.
+
+Every task, seed and variant of a method is a *lane* of one compiled program. Lanes are spread over the
+devices and, on each, run in *groups*: the lanes of a group share one clock, so that a group's episode ends
+with its slowest lane. On a CPU a group is as large as the memories of its agents fit into the cache near a
+core, or as large as a step of the world needs to be worth its call.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, PRNGKeyArray
+from tqdm import tqdm
+
+from envs.base import Environment, Episode, Goals, Task
+from envs.errors import UsageError
+from envs.registry import Judgement
+from mgpo_jax.adaptation import (
+    Adapter,
+    AdaptLog,
+    Judged,
+    proceed,
+    start,
+)
+from mgpo_jax.methods import Method, Setting, find, split_hyper, with_numbers
+from mgpo_jax.policy import LoadedPolicy, transformer_policy
+from mgpo_jax.rollout import Query, rollout
+from mgpo_jax.sharding import AXIS, device_mesh, fetch, replicate, split
+from mgpo_jax.tasks import num_tasks
+from mgpo_jax.transformer import TransformerConfig
+
+# Bytes of the agents' memories (key-value caches) in a group: what fits into the cache of a CPU's core, or
+# into the memory of an accelerator.
+GROUP_BYTES, GROUP_BYTES_ACCELERATOR = 3 << 20, 4 << 30
+
+
+class Reached(NamedTuple):
+    """The goals that episodes reached, of all episodes one after another."""
+
+    counts: np.ndarray
+    """``[S, N, E]``: how many goals each episode reached."""
+    steps: np.ndarray
+    """``[total]``: in which step each was reached, counted from 0."""
+    goals: np.ndarray
+    """``[total, G]``."""
+
+
+class Outcome(NamedTuple):
+    """Raw results of one method, axes S seeds, N tasks, E episodes, R rounds, C judgements."""
+
+    returns: np.ndarray
+    """``[S, N, E]`` returns of the search's episodes."""
+    failed: np.ndarray
+    """``[S, N, E]``: whether the world broke down."""
+    choices: Any
+    """Who acted, leaves ``[S, N, R, ..]``."""
+    best: Any
+    """The best choice after each round, leaves ``[S, N, R, ..]``."""
+    keys: np.ndarray
+    """``[S, N, E, 2]``: raw random keys of the episodes."""
+    actions: np.ndarray | None
+    """``[S, N, E, T]`` small integers (``adaptation.small_actions``); None if they were not kept."""
+    reached: Reached
+    eval_episodes: np.ndarray
+    """``[C]``: after how many episodes the best choice was judged."""
+    eval_returns: np.ndarray
+    """``[S, N, C]``: mean return of the judging episodes. The first is that of the initial choice."""
+    num_episodes: int
+    """All episodes that were run: those of the search and those that judged."""
+    num_failed: int
+    """Those that the world ended because it broke down."""
+    cpu_seconds: float
+    """CPU time of all of them, without compilation."""
+
+
+def together(env: Environment, function: Callable, in_axes: Any = 0) -> Any:
+    """A compiled ``function`` over many episodes, which share one clock on one device."""
+    options = dict(env.engine.compiler_options)
+    return jax.jit(jax.vmap(function, in_axes=in_axes), compiler_options=options)
+
+
+def adapt(
+    env: Environment,
+    policy: LoadedPolicy,
+    tasks: Task,
+    method: Method | str = "ucb",
+    hyper: Any = None,
+    **options: Any,
+) -> Outcome:
+    """Adapt a policy to every task with every seed.
+
+    Args:
+      env: the world.
+      policy: who starts.
+      tasks: N tasks, stacked.
+      method: who adapts, as a record or by name.
+      hyper: the method's hyper-parameters, as its record or as a dict of those that differ from the
+        defaults.
+      **options: those of ``sweep``: ``seeds``, ``episodes``, ``seed``, ``eval_every``, ``judged`` and
+        ``keep_actions``.
+
+    Raises:
+      UsageError: if the method cannot be used in this setting.
+    """
+    method = find(method) if isinstance(method, str) else method
+    if hyper is None or isinstance(hyper, dict):
+        hyper = method.hyper_from(hyper or {})
+    (outcome,) = sweep(env, policy, tasks, method, [hyper], **options)
+    return outcome
+
+
+def sweep(
+    env: Environment,
+    policy: LoadedPolicy,
+    tasks: Task,
+    method: Method,
+    hypers: Sequence[Any],
+    *,
+    seeds: int = 3,
+    episodes: int = 100,
+    seed: int = 0,
+    eval_every: int = 10,
+    judged: Judgement | None = None,
+    keep_actions: bool = False,
+) -> list[Outcome]:
+    """One outcome for each variant of a method's hyper-parameters, all from one program.
+
+    Args:
+      env: the world.
+      policy: who starts.
+      tasks: N tasks, stacked.
+      method: who adapts.
+      hypers: the variants. All see the same tasks and random keys; their numbers are data, so that a
+        sweep compiles once.
+      seeds: independent adaptations to each task.
+      episodes: the budget of each.
+      seed: seed of all of them.
+      eval_every: episodes between judgements of the best choice.
+      judged: how the best choice is judged (default: one greedy episode).
+      keep_actions: whether to keep continuous actions; discrete ones are always kept.
+
+    Raises:
+      UsageError: if the method cannot be used in this setting.
+    """
+    network, params = policy.config, policy.params
+    setting = Setting(env, network, episodes, judged or Judgement())
+    for hyper in hypers:
+        method.check_use(setting, hyper)
+    fixed, numbers = split_hyper(hypers)
+    adapter = method.adapter(setting, params, hypers[0])
+    segments = _segments(adapter, episodes, eval_every)
+    grid = Grid(variants=len(hypers), seeds=seeds, tasks=num_tasks(tasks))
+    layout = _lay_out(env, grid.size, _memory_bytes(env, adapter, tasks))
+    program = _program(method, setting, fixed, layout, max(segments), keep_actions)
+    lanes = split(layout.mesh, grid.lanes(layout, tasks, seed, numbers))
+    shared = replicate(layout.mesh, params)
+    record, cpu = _run(program, lanes, shared, segments, grid)
+    judging = (len(segments) + 1) * setting.judged.episodes
+    per_lane = episodes + judging
+    # The search, too, begins with one evaluation of the initial choice.
+    after = np.concatenate([[1], np.cumsum(segments) * adapter.episodes_per_round])
+    return [
+        record.outcome(
+            variant=variant,
+            grid=grid,
+            after=after,
+            num_episodes=round(layout.num_lanes * per_lane / len(hypers)),
+            cpu_seconds=cpu / len(hypers),
+        )
+        for variant in range(len(hypers))
+    ]
+
+
+def _segments(adapter: Adapter, episodes: int, eval_every: int) -> list[int]:
+    """The budget as numbers of rounds between judgements; the last one is what is left."""
+    num = adapter.episodes_per_round
+    if episodes % num or eval_every % num:
+        raise UsageError(
+            f"the method runs {num} episodes in a round: the budget of {episodes} episodes and the "
+            f"{eval_every} episodes between evaluations must be multiples of {num}"
+        )
+    whole, rest = divmod(episodes, eval_every)
+    return [eval_every // num] * whole + ([rest // num] if rest else [])
+
+
+class Lanes(NamedTuple):
+    """What each lane has of its own."""
+
+    task: Task
+    key: PRNGKeyArray
+    numbers: dict[str, Array]
+    """Hyper-parameters that are data."""
+
+
+class Layout(NamedTuple):
+    """How lanes are spread: over devices, and on each in groups that share a clock."""
+
+    mesh: Mesh
+    group: int
+    num_lanes: int
+    """With those that only fill up the last groups."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """How lanes are numbered: variants, then seeds, then tasks."""
+
+    variants: int
+    seeds: int
+    tasks: int
+
+    @property
+    def size(self) -> int:
+        return self.variants * self.seeds * self.tasks
+
+    def lanes(
+        self, layout: Layout, tasks: Task, seed: int, numbers: dict[str, list[float]]
+    ) -> Lanes:
+        """The lanes; those beyond the last variant repeat the first ones to fill up a group."""
+        index = np.arange(layout.num_lanes)
+        runs = self.seeds * self.tasks
+        which = index // runs % self.variants
+        return Lanes(
+            task=jax.tree.map(lambda leaf: jnp.asarray(leaf)[index % self.tasks], tasks),
+            key=jax.random.split(jax.random.key(seed), runs)[index % runs],
+            numbers={name: jnp.array(values)[which] for name, values in numbers.items()},
+        )
+
+    def shape(self, rows: np.ndarray) -> np.ndarray:
+        """Rows of lanes as ``[variants, S, N, ..]``, without the lanes that only fill up groups."""
+        return rows[: self.size].reshape(self.variants, self.seeds, self.tasks, *rows.shape[1:])
+
+
+def _memory_bytes(env: Environment, adapter: Adapter, tasks: Task) -> int:
+    """Bytes of an agent's memory at the end of an episode."""
+
+    def memory(key: PRNGKeyArray, task: Task) -> Any:
+        search = adapter.init(key, env.task_goal(task))
+        choice, search = adapter.ask(key, search)
+        agent = adapter.agent(search, choice)
+        _, _, memory = agent.begin(key, task, *env.reset(key, task))
+        return agent.grow(memory, env.spec.horizon - 1)
+
+    task = jax.tree.map(lambda leaf: leaf[0], tasks)
+    shapes = jax.eval_shape(memory, jax.random.key(0), task)
+    return sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes))
+
+
+def lanes_together(env: Environment, memory_bytes: int) -> int:
+    """How many lanes share a clock."""
+    limit = GROUP_BYTES if jax.default_backend() == "cpu" else GROUP_BYTES_ACCELERATOR
+    return max(env.engine.worlds_together, limit // max(memory_bytes, 1), 1)
+
+
+def _lay_out(env: Environment, num_lanes: int, memory_bytes: int) -> Layout:
+    """Spread at least ``num_lanes`` lanes evenly."""
+    mesh = device_mesh()
+    on_each = -(-num_lanes // mesh.devices.size)
+    num_groups = -(-on_each // lanes_together(env, memory_bytes))
+    group = -(-on_each // num_groups)
+    return Layout(mesh, group, mesh.devices.size * num_groups * group)
+
+
+def _over_lanes(env: Environment, layout: Layout, function: Callable) -> Any:
+    """A jitted ``function(own, shared)`` over all lanes."""
+    spread, copied = PartitionSpec(AXIS), PartitionSpec()
+
+    def on_device(own: Any, shared: Any) -> Any:
+        grouped = jax.tree.map(lambda leaf: leaf.reshape(-1, layout.group, *leaf.shape[1:]), own)
+        done = jax.lax.map(lambda own: jax.vmap(function, in_axes=(0, None))(own, shared), grouped)
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), done)
+
+    mapped = jax.shard_map(
+        on_device, mesh=layout.mesh, in_specs=(spread, copied), out_specs=spread, check_vma=False
+    )
+    return jax.jit(mapped, compiler_options=dict(env.engine.compiler_options))
+
+
+class Program:
+    """A jitted function that is compiled once for each set of shapes, outside of any measured time."""
+
+    def __init__(self, jitted: Any) -> None:
+        self._jitted = jitted
+        self._compiled: dict[Any, Any] = {}
+
+    def compile(self, *args: Any) -> Any:
+        shapes, tree = jax.tree.flatten(jax.tree.map(jax.typeof, args))
+        where = (tuple(shapes), tree)
+        if where not in self._compiled:
+            self._compiled[where] = self._jitted.lower(*args).compile()
+        return self._compiled[where]
+
+
+class Search(NamedTuple):
+    """The two programs of an adaptation."""
+
+    start: Program
+    """``(lanes, params) -> state``."""
+    advance: Program
+    """``((state, lanes), (params, number of rounds, number of the judgement)) -> (state, log, judged)``."""
+    num_judged: int
+
+
+@cache
+def _program(
+    method: Method,
+    setting: Setting,
+    fixed: Any,
+    layout: Layout,
+    max_rounds: int,
+    keep_actions: bool,
+) -> Search:
+    """The programs that search with a method; equal arguments share them within a process."""
+    env = setting.env
+
+    def begin(own: Lanes, params: Any) -> Any:
+        adapter = method.adapter(setting, params, with_numbers(fixed, own.numbers))
+        return start(own.key, env, adapter, own.task)
+
+    def advance(own: tuple[Any, Lanes], shared: tuple[Any, Array, Array]) -> Any:
+        state, lane = own
+        params, num_rounds, number = shared
+        return proceed(
+            state,
+            env,
+            method.adapter(setting, params, with_numbers(fixed, lane.numbers)),
+            lane.task,
+            num_rounds,
+            max_rounds=max_rounds,
+            judge_key=jax.random.fold_in(lane.key, number),
+            num_judged=setting.judged.episodes,
+            keep_actions=keep_actions,
+        )
+
+    return Search(
+        Program(_over_lanes(env, layout, begin)),
+        Program(_over_lanes(env, layout, advance)),
+        setting.judged.episodes,
+    )
+
+
+class Record(NamedTuple):
+    """What an adaptation left behind, rows of lanes; the log is without the goals that were reached."""
+
+    log: AdaptLog
+    judged: Judged
+    reached: list[Goals]
+    """The goals of each segment's episodes, ``[lanes, R, K, T, ..]``."""
+
+    def outcome(
+        self, variant: int, grid: Grid, after: np.ndarray, num_episodes: int, cpu_seconds: float
+    ) -> Outcome:
+        """The results of one variant."""
+
+        def of_variant(rows: Any) -> np.ndarray:
+            return grid.shape(rows)[variant]
+
+        def by_episode(rows: Any) -> np.ndarray:
+            rows = of_variant(rows)
+            return rows.reshape(*rows.shape[:2], -1, *rows.shape[4:])
+
+        failed = by_episode(self.log.failed)
+        num_failed = failed.sum() + of_variant(self.judged.num_failed).sum()
+        return Outcome(
+            returns=by_episode(self.log.returns),
+            failed=failed,
+            choices=jax.tree.map(of_variant, self.log.choices),
+            best=jax.tree.map(of_variant, self.log.best),
+            keys=by_episode(self.log.played.key),
+            actions=jax.tree.map(by_episode, self.log.played.actions),
+            reached=_reached([jax.tree.map(by_episode, goals) for goals in self.reached]),
+            eval_episodes=after,
+            eval_returns=of_variant(self.judged.return_),
+            num_episodes=num_episodes,
+            num_failed=int(num_failed),
+            cpu_seconds=cpu_seconds,
+        )
+
+
+def _run(
+    search: Search, lanes: Lanes, params: Any, segments: Sequence[int], grid: Grid
+) -> tuple[Record, float]:
+    """Run all segments of an adaptation, each followed by a judgement; the first judgement comes before.
+
+    The second result is the CPU time that it took, without compilation.
+    """
+    state = search.start.compile(lanes, params)(lanes, params)
+    logs: list[AdaptLog] = []
+    judgements: list[Judged] = []
+    advance = search.advance.compile((state, lanes), (params, jnp.int32(0), jnp.int32(0)))
+    cpu = time.process_time()
+
+    with tqdm(total=1, unit="episode", disable=None) as progress:
+        for number, num_rounds in enumerate([0, *segments]):
+            shared = (params, jnp.int32(num_rounds), jnp.int32(number))
+            state, log, judged = advance((state, lanes), shared)
+            judgements.append(fetch(judged))
+            log = jax.tree.map(lambda rows, n=num_rounds: rows[:, :n], fetch(log))
+            per_round = log.returns.shape[-1] * grid.size
+            progress.total = sum(segments) * per_round
+            progress.update(num_rounds * per_round)
+            if num_rounds:
+                logs.append(log)
+    cpu = time.process_time() - cpu
+    goals = [log.played.goals for log in logs]
+    whole = jax.tree.map(lambda *rows: np.concatenate(rows, axis=1), *map(_without_goals, logs))
+    judged = jax.tree.map(lambda *rows: np.stack(rows, axis=-1), *judgements)
+    return Record(whole, judged, goals), cpu
+
+
+def _without_goals(log: AdaptLog) -> AdaptLog:
+    """The log without the goals that were reached, which take most of its memory."""
+    nothing: Any = None
+    return log._replace(played=log.played._replace(goals=nothing))
+
+
+def _reached(segments: Sequence[Goals]) -> Reached:
+    """The goals reached in the episodes of consecutive segments, ``[S, N, E, T, ..]`` each."""
+    real = [
+        goals.goal_reached & (np.arange(goals.goal_reached.shape[-1]) < goals.length[..., None])
+        for goals in segments
+    ]
+    counts = np.concatenate([which.sum(axis=-1) for which in real], axis=2)
+    reached = np.concatenate(real, axis=2)
+    steps = np.nonzero(reached)[-1]
+    achieved = np.concatenate([goals.achieved_goals for goals in segments], axis=2)
+    small = np.min_scalar_type(reached.shape[-1])
+    return Reached(counts.astype(np.int32), steps.astype(small), achieved[reached])
+
+
+def evaluate(
+    env: Environment,
+    policy: LoadedPolicy,
+    tasks: Task,
+    queries: Query,
+    *,
+    episodes: int,
+    seed: int = 0,
+) -> tuple[np.ndarray, int]:
+    """Mean returns ``[S, N]`` of queries with leaves ``[S, N, ..]``, one for each seed and task.
+
+    The second result is how many episodes a broken world ended.
+    """
+    network = policy.config
+    seeds, num = queries.prompt.mask.shape[:2]
+    grid = Grid(variants=1, seeds=seeds, tasks=num)
+
+    def measure(own: tuple[Lanes, Query], params: Any) -> Judged:
+        lane, query = own
+        policy = transformer_policy(network, params)
+
+        def episode(key: PRNGKeyArray) -> tuple[Array, Array]:
+            done = rollout(key, env, policy, lane.task, query)
+            return done.return_, jnp.asarray(done.failed)
+
+        returns, failed = jax.lax.map(episode, jax.random.split(lane.key, episodes))
+        return Judged(returns.mean(), failed.sum())
+
+    layout = _lay_out(env, grid.size, cache_bytes(network))
+    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), queries)
+    index = np.arange(layout.num_lanes) % grid.size
+    own = (
+        grid.lanes(layout, tasks, seed, {}),
+        jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], flat),
+    )
+    run = _over_lanes(env, layout, measure)
+    found = fetch(run(split(layout.mesh, own), replicate(layout.mesh, policy.params)))
+    found = jax.tree.map(lambda rows: grid.shape(rows)[0], found)
+    return found.return_, int(found.num_failed.sum())
+
+
+def cache_bytes(network: TransformerConfig) -> int:
+    """Bytes of the key-value cache of an episode."""
+    num_tokens = network.max_prompt_length + 2 * network.horizon - 1
+    return 4 * 2 * network.num_layers * network.embed_dim * num_tokens
+
+
+@cache
+def _player(env: Environment, network: TransformerConfig) -> Any:
+    def episode(key: PRNGKeyArray, params: Any, task: Task, query: Query) -> Episode:
+        return rollout(key, env, transformer_policy(network, params), task, query)
+
+    return together(env, episode, in_axes=(0, None, None, None))
+
+
+def play(
+    key: PRNGKeyArray, env: Environment, policy: LoadedPolicy, task: Task, query: Query, num: int
+) -> Episode:
+    """``num`` episodes of a policy on one task, numpy leaves ``[num, ..]``."""
+    keys = jax.random.split(key, num)
+    return fetch(_player(env, policy.config)(keys, policy.params, task, query))

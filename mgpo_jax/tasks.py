@@ -1,0 +1,133 @@
+"""Task sets: the fixed test tasks of each world, others to choose settings by, and a user's own.
+
+A set of N tasks is one pytree whose leaves are stacked on a leading axis.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from envs.base import Environment, Task
+from envs.errors import DataError, UsageError
+from envs.registry import World, find
+from mgpo_jax.dataset import hash_task
+from mgpo_jax.files import load_arrays
+from mgpo_jax.policy_files import released_folder
+
+# Streams of task seeds that never meet: test, evaluation while training; data seeds count from 0.
+TEST_SEED, EVAL_SEED = 1_000_003, 1_000_033
+
+
+def sample_tasks(env: Environment, seed: int, num: int) -> Task:
+    """``num`` random tasks."""
+    return _task_sampler(env)(jax.random.split(jax.random.key(seed), num))
+
+
+@cache
+def _task_sampler(env: Environment) -> Any:
+    return jax.jit(jax.vmap(env.sample_task))
+
+
+def benchmark_tasks(env: Environment, num: int) -> Task:
+    """``num`` test tasks of a world, all different: the same for everyone, and in no dataset."""
+    drawn = sample_tasks(env, TEST_SEED, 2 * num)
+    rows = [np.asarray(leaf).reshape(2 * num, -1) for leaf in jax.tree.leaves(drawn)]
+    _, first = np.unique(np.concatenate(rows, axis=1), axis=0, return_index=True)
+    if len(first) < num:
+        raise DataError(f"{env.spec.name} has too few tasks to test on {num} different ones")
+    chosen = np.sort(first)[:num]
+    return jax.tree.map(lambda leaf: leaf[chosen], drawn)
+
+
+def test_tasks(world: World | str) -> Task:
+    """The test tasks of a world, by its record, name or place: the released ones where there are any."""
+    world = find(world) if isinstance(world, str) else world
+    env, released = world.make(), released_folder(world) / "tasks.npz"
+    if released.is_file():
+        return load_tasks(released, env)
+    return benchmark_tasks(env, world.num_test_tasks)
+
+
+def evaluation_tasks(env: Environment, num: int, num_test_tasks: int) -> Task:
+    """Tasks to watch a training or to choose settings by: none of them is a test task."""
+    drawn = sample_tasks(env, EVAL_SEED, 2 * num)
+    forbidden = task_hashes(env, benchmark_tasks(env, num_test_tasks))
+    allowed = ~np.isin(task_hashes(env, drawn), forbidden)
+    chosen = np.flatnonzero(allowed)[:num]
+    if len(chosen) < num:
+        raise DataError(f"{env.spec.name} has too few tasks to evaluate on {num} others")
+    return jax.tree.map(lambda leaf: leaf[chosen], drawn)
+
+
+def task_hashes(env: Environment, tasks: Task) -> np.ndarray:
+    """A hash of each task's fingerprint, [N] uint64."""
+    prints = np.asarray(jax.vmap(env.fingerprint)(tasks))
+    return np.array([hash_task(one) for one in prints], np.uint64)
+
+
+def num_tasks(tasks: Task) -> int:
+    return len(jax.tree.leaves(tasks)[0])
+
+
+def task_at(tasks: Task, index: int) -> Task:
+    """One task of a set."""
+    return jax.tree.map(lambda leaf: leaf[index], tasks)
+
+
+def task_arrays(tasks: Task) -> dict[str, np.ndarray]:
+    """The arrays of a set of tasks by the names of their fields."""
+    paths, _ = jax.tree_util.tree_flatten_with_path(tasks)
+    return {
+        jax.tree_util.keystr(path, simple=True, separator=".") or "task": np.asarray(leaf)
+        for path, leaf in paths
+    }
+
+
+def save_tasks(path: Path, tasks: Task) -> None:
+    np.savez_compressed(path, allow_pickle=False, **task_arrays(tasks))
+
+
+def load_tasks(path: Path, env: Environment) -> Task:
+    """Read tasks from an npz file with one array for each field of the world's task.
+
+    Raises:
+      UsageError: if there is no such file.
+      DataError: if it cannot be read or holds something that is no task.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UsageError(f"no task file {path}")
+    return tasks_from(load_arrays(path), env, path)
+
+
+def tasks_from(arrays: dict[str, np.ndarray], env: Environment, where: Path | str) -> Task:
+    """A set of tasks from arrays by the names of their fields.
+
+    Raises:
+      DataError: if an array is missing or holds something that is no task; the message begins with
+        ``where``.
+    """
+    example: Any = jax.eval_shape(env.sample_task, jax.random.key(0))
+    names = [
+        jax.tree_util.keystr(p, simple=True, separator=".") or "task"
+        for p, _ in jax.tree_util.tree_flatten_with_path(example)[0]
+    ]
+    if missing := [name for name in names if name not in arrays]:
+        raise DataError(
+            f"{where} lacks {', '.join(missing)}; tasks of {env.spec.name} need the arrays "
+            f"{', '.join(names)}"
+        )
+    leaves = [arrays[name] for name in names]
+    if any(array.ndim == 0 or len(array) == 0 for array in leaves):
+        raise DataError(f"{where} holds no tasks")
+    tasks = jax.tree.unflatten(jax.tree.structure(example), leaves)
+    try:
+        env.check_task(tasks)
+    except ValueError as error:
+        raise DataError(f"{where}: {error}") from None
+    return jax.tree.map(lambda array, like: array.astype(like.dtype), tasks, example)

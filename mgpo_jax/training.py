@@ -1,0 +1,386 @@
+"""Pre-training: behavior cloning with hindsight multi-goal prompts (paper, section 3.1, Eq. 2).
+
+A gradient step is accumulated over parts of a batch (microbatches). Each part holds trajectories of nearly
+equal length, which need little padding, is small enough that its activations stay in cache, and is divided
+among the devices. Every random draw is a function of the seed and the step number, so that a run continued
+from a checkpoint equals one that was never interrupted, bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.flatten_util import ravel_pytree
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Float, Key, PRNGKeyArray
+from tqdm import tqdm
+
+from envs.base import EnvSpec, Trajectory
+from envs.errors import UsageError
+from mgpo_jax.dataset import BatchPlan, Dataset, check_dataset, plan_batches
+from mgpo_jax.policy import LoadedPolicy
+from mgpo_jax.prompts import hindsight_outcome, sample_prompt, single_goal
+from mgpo_jax.settings import TrainConfig, check_settings
+from mgpo_jax.sharding import (
+    AXIS,
+    device_mesh,
+    fetch,
+    gather_rows,
+    largest_divisor,
+    replicate,
+    split,
+)
+from mgpo_jax.transformer import GoalTransformer, TransformerConfig, network_config
+
+HIT = 0.1  # per-dimension tolerance for counting a predicted action as correct
+# Root mean square of a typical AdamW update before the learning rate.
+ADAMW_RMS = 0.2
+
+
+class TrainState(NamedTuple):
+    """Everything a run carries from one gradient step to the next."""
+
+    params: Any
+    opt_state: Any
+    step: int
+
+
+class Stats(NamedTuple):
+    """Sums over real steps."""
+
+    nll: Float[Array, "*batch"]
+    correct: Float[Array, "*batch"]
+    """Actions whose likeliest prediction is the demonstrated one, within ``HIT`` in each dimension."""
+    num_steps: Float[Array, "*batch"]
+
+
+def learning_rate_schedule(config: TrainConfig) -> optax.Schedule:
+    rate, warmup = config.learning_rate, min(config.warmup_steps, config.steps - 1)
+    if config.schedule == "cosine":
+        return optax.warmup_cosine_decay_schedule(0.0, rate, warmup, config.steps, 0.02 * rate)
+    return optax.linear_schedule(0.0, rate, warmup) if warmup else optax.constant_schedule(rate)
+
+
+def make_optimizer(
+    config: TrainConfig, unravel: Callable[[Any], Any]
+) -> optax.GradientTransformation:
+    """The optimizer, on weights that are one vector.
+
+    Muon (Jordan 2024) makes the update of a matrix orthogonal; its scale is matched to AdamW's (Liu et
+    al. 2025), so that one learning rate serves both.
+
+    Args:
+      config: settings of the training.
+      unravel: gives the vector's parts their shapes and names, which Muon needs.
+    """
+    rate, decay = learning_rate_schedule(config), config.weight_decay
+    clip = optax.clip_by_global_norm(config.clip_norm)
+    if config.optimizer == "adamw":
+        return optax.chain(clip, optax.adamw(rate, weight_decay=decay))
+    muon = optax.contrib.muon(
+        rate,
+        weight_decay=decay,
+        adam_weight_decay=decay,
+        consistent_rms=ADAMW_RMS,
+        muon_weight_dimension_numbers=_block_matrices,
+    )
+
+    def init(weights: Array) -> Any:
+        return muon.init(unravel(weights))
+
+    def update(grads: Array, state: Any, weights: Array | None = None) -> tuple[Array, Any]:
+        updates, state = muon.update(unravel(grads), state, unravel(weights))
+        return ravel_pytree(updates)[0], state
+
+    return optax.chain(clip, optax.GradientTransformation(init, update))
+
+
+def _block_matrices(params: Any) -> Any:
+    """The matrices between hidden layers; embeddings and the head are left to AdamW."""
+
+    def kind(path: Any, leaf: Array) -> Any:
+        in_block = any(str(part.key).startswith("blocks") for part in path)
+        return optax.contrib.MuonDimensionNumbers() if in_block and leaf.ndim == 2 else None
+
+    return jax.tree_util.tree_map_with_path(kind, params)
+
+
+def blurred(key: PRNGKeyArray, trajectory: Trajectory, largest: float) -> Trajectory:
+    """The trajectory seen through noise of one size, uniform in [0, ``largest``].
+
+    A policy that saw only exact observations trusts their last digits; one that saw a single size of
+    noise does less well without any.
+    """
+    key_size, key_noise = jax.random.split(key)
+    size = largest * jax.random.uniform(key_size)
+    noise = size * jax.random.normal(key_noise, trajectory.obs.shape)
+    return trajectory._replace(obs=trajectory.obs + noise)
+
+
+def bc_loss(
+    params: Any,
+    key: PRNGKeyArray,
+    network: GoalTransformer,
+    trajectory: Trajectory,
+    deterministic: bool = False,
+    obs_noise: float = 0.0,
+) -> tuple[Float[Array, ""], Stats]:
+    """-sum_t log pi(a_t | p, h_{t-1}, o_t) of one trajectory, with p ~ P(p | tau) (Eq. 2).
+
+    Args:
+      params: weights of the network.
+      key: random key.
+      network: the policy's network.
+      trajectory: a demonstration, arrays of T steps.
+      deterministic: no dropout and no noise.
+      obs_noise: as in ``TrainConfig`` (static; not in the paper).
+    """
+    key_prompt, key_dropout, key_noise = jax.random.split(key, 3)
+    if obs_noise and not deterministic:
+        trajectory = blurred(key_noise, trajectory, obs_noise)
+    num_slots = network.config.max_prompt_length
+    prompt = sample_prompt(key_prompt, trajectory, hindsight_outcome(trajectory), num_slots)
+    distribution: Any = network.apply(
+        params,
+        prompt,
+        trajectory.obs,
+        trajectory.actions,
+        deterministic or network.config.dropout == 0,
+        rngs={"dropout": key_dropout},
+    )
+    real = jnp.arange(len(trajectory.obs)) < trajectory.length
+    nll = -jnp.sum(jnp.where(real, distribution.log_prob(trajectory.actions), 0.0))
+    hits = jnp.abs(distribution.mode() - trajectory.actions) <= HIT
+    hits = jnp.all(hits.reshape(len(real), -1), axis=1)
+    correct = jnp.sum(hits & real).astype(jnp.float32)
+    return nll, Stats(nll, correct, trajectory.length.astype(jnp.float32))
+
+
+def batch_loss(
+    params: Any,
+    keys: Key[Array, "B"],
+    part: Trajectory,
+    deterministic: bool,
+    network: GoalTransformer,
+    obs_noise: float,
+) -> tuple[Float[Array, ""], Stats]:
+    """The loss and statistics of several trajectories, summed."""
+
+    def one(key: PRNGKeyArray, trajectory: Trajectory) -> tuple[Array, Stats]:
+        return bc_loss(params, key, network, trajectory, deterministic, obs_noise)
+
+    nll, stats = jax.vmap(one)(keys, part)
+    return nll.sum(), jax.tree.map(jnp.sum, stats)
+
+
+def initial_params(key: PRNGKeyArray, network: GoalTransformer, dataset: Dataset) -> Any:
+    """Random weights of a network for the trajectories of a dataset."""
+    first = jax.tree.map(jnp.asarray, dataset.gather(np.array([0]), np.array([1]), 1))
+    one = jax.tree.map(lambda leaf: leaf[0], first)
+    prompt = single_goal(one.outcomes[0], network.config.max_prompt_length)
+    return network.init(key, prompt, one.obs, one.actions)
+
+
+def _flatten(params: Any) -> Array:
+    return ravel_pytree(params)[0]
+
+
+def _on_devices(
+    mesh: Mesh, function: Callable, in_specs: Any, out_specs: Any, **options: Any
+) -> Any:
+    """A jitted function that runs on every device by itself, without collectives."""
+    mapped = jax.shard_map(
+        function, mesh=mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False
+    )
+    return jax.jit(mapped, **options)
+
+
+class _Accumulator:
+    """Sums gradients and statistics over the parts of a batch, a row for each device.
+
+    Weights and gradients travel between devices as one vector: a handful of passes over memory instead of
+    a handful for each of some fifty small arrays.
+    """
+
+    def __init__(
+        self, mesh: Mesh, loss: Callable, shapes: Any, unravel: Callable[[Any], Any]
+    ) -> None:
+        self.mesh = mesh
+        spread, copied = PartitionSpec(AXIS), PartitionSpec()
+
+        def add(params: Any, sums: Any, keys: Key[Array, "B"], part: Trajectory) -> Any:
+            added = jax.grad(loss, has_aux=True)(params, keys, part, False)
+            return jax.tree.map(lambda row, new: row + new, sums, added)
+
+        def zeros() -> Any:
+            num = mesh.devices.size
+            grads = jax.tree.map(lambda leaf: jnp.zeros((num, *leaf.shape)), shapes)
+            return grads, Stats(*jnp.zeros((3, num)))
+
+        self.unpack = _on_devices(mesh, unravel, copied, copied)
+        self.pack = _on_devices(
+            mesh, lambda sums: (_flatten(sums[0])[None], sums[1]), spread, spread
+        )
+        self.add = _on_devices(
+            mesh, add, (copied, spread, spread, spread), spread, donate_argnums=1
+        )
+        self.zeros = jax.jit(zeros, out_shardings=NamedSharding(mesh, spread))
+
+    def sums(self, weights: Array, parts: Iterator[tuple[Any, Trajectory]]) -> list[Any]:
+        """One ``(gradient vector, Stats)`` for each device, over ``(keys, part)`` pairs."""
+        params, sums = self.unpack(replicate(self.mesh, weights)), self.zeros()
+        for keys, part in parts:
+            sums = self.add(params, sums, keys, split(self.mesh, part))
+        return gather_rows(self.mesh, self.pack(sums))
+
+
+def _make_update(
+    optimizer: optax.GradientTransformation, unravel: Callable[[Any], Any]
+) -> Callable[[Any, Any, list[Any]], tuple[Any, Any, dict[str, Array]]]:
+    """``(params, opt_state, rows of sums) -> (params, opt_state, metrics)``."""
+
+    @partial(jax.jit, donate_argnums=(0, 1))
+    def update(params: Any, opt_state: Any, rows: list[Any]) -> tuple[Any, Any, dict[str, Array]]:
+        flat, stats = jax.tree.map(lambda *of_devices: sum(of_devices)[0], *rows)
+        grads, weights = flat / stats.num_steps, _flatten(params)
+        updates, opt_state = optimizer.update(grads, opt_state, weights)
+        metrics = {
+            "loss": stats.nll / stats.num_steps,
+            "accuracy": stats.correct / stats.num_steps,
+            "grad_norm": optax.tree.norm(grads),
+            "num_steps": stats.num_steps,
+        }
+        return unravel(optax.apply_updates(weights, updates)), opt_state, metrics
+
+    return update
+
+
+class Trainer:
+    """The compiled pieces of a training run on one dataset.
+
+    Args:
+      config: how to train.
+      network_config: the network.
+      dataset: the trajectories to learn from.
+      mesh: the devices to divide the parts of a batch among.
+
+    Raises:
+      UsageError: if the devices do not divide ``config.part_size``, a setting is out of its bounds, or
+        noise is asked for on observations that are integers.
+    """
+
+    def __init__(
+        self, config: TrainConfig, network_config: TransformerConfig, dataset: Dataset, mesh: Mesh
+    ) -> None:
+        check_settings(config)
+        if config.part_size % mesh.devices.size:
+            raise UsageError(
+                f"part_size {config.part_size} does not divide over {mesh.devices.size} devices"
+            )
+        if config.obs_noise and not np.issubdtype(dataset.obs.dtype, np.floating):
+            raise UsageError(
+                f"--obs-noise needs floating-point observations, the dataset's are {dataset.obs.dtype}"
+            )
+        network = GoalTransformer(network_config)
+        self._key_init, key_steps, self._key_eval = jax.random.split(jax.random.key(config.seed), 3)
+        self._dataset = dataset
+        self._initial_params = partial(initial_params, self._key_init, network, dataset)
+        shapes = jax.eval_shape(self._initial_params)
+        blank = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
+        _, unravel = ravel_pytree(blank)
+        self._flatten = jax.jit(_flatten)
+        self._optimizer = make_optimizer(config, unravel)
+        loss = partial(batch_loss, network=network, obs_noise=config.obs_noise)
+        self._accumulator = _Accumulator(mesh, loss, shapes, unravel)
+        self._update = _make_update(self._optimizer, unravel)
+
+        @partial(jax.jit, static_argnums=2, out_shardings=NamedSharding(mesh, PartitionSpec(AXIS)))
+        def part_keys(step: Any, index: Any, num: int) -> Key[Array, "B"]:
+            key = jax.random.fold_in(jax.random.fold_in(key_steps, step), index)
+            return jax.random.split(key, num)
+
+        @jax.jit
+        def part_stats(params: Any, key: PRNGKeyArray, part: Trajectory) -> Stats:
+            return loss(params, jax.random.split(key, part.length.shape[0]), part, True)[1]
+
+        self._part_keys, self._part_stats = part_keys, part_stats
+
+    def init(self) -> TrainState:
+        """The state before the first step."""
+        params = self._initial_params()
+        return TrainState(params, self._optimizer.init(self._flatten(params)), 0)
+
+    def step(
+        self, state: TrainState, plans: list[BatchPlan]
+    ) -> tuple[TrainState, dict[str, Array]]:
+        """One gradient step on the parts of a batch, and its metrics."""
+        parts = (
+            (self._part_keys(state.step, index, len(plan.lengths)), self._dataset.gather(*plan))
+            for index, plan in enumerate(plans)
+        )
+        rows = self._accumulator.sums(self._flatten(state.params), parts)
+        params, opt_state, metrics = self._update(state.params, state.opt_state, rows)
+        return TrainState(params, opt_state, state.step + 1), metrics
+
+    def evaluate(self, params: Any, plans: list[BatchPlan]) -> dict[str, float]:
+        """Mean loss and accuracy of some weights, without dropout and noise."""
+        stats = [
+            self._part_stats(params, self._key_eval, self._dataset.gather(*plan)) for plan in plans
+        ]
+        total = jax.tree.map(lambda *leaves: float(sum(leaves)), *fetch(stats))
+        return {"loss": total.nll / total.num_steps, "accuracy": total.correct / total.num_steps}
+
+
+def batch_stream(
+    config: TrainConfig, dataset: Dataset, truncate: bool, num_devices: int = 1, first_step: int = 0
+) -> Iterator[list[BatchPlan]]:
+    """The batches of a run from ``first_step`` on."""
+    return plan_batches(
+        dataset,
+        seed=config.seed,
+        batch_size=config.batch_size,
+        part_size=config.part_size,
+        bucket=config.bucket,
+        truncate=truncate,
+        part_steps=config.part_steps,
+        min_part=num_devices,
+        first_step=first_step,
+    )
+
+
+def pretrain(
+    dataset: Dataset,
+    spec: EnvSpec,
+    config: TrainConfig | None = None,
+    **network: Any,
+) -> LoadedPolicy:
+    """Pre-train a policy on a dataset, in memory and from the first step to the last.
+
+    ``experiments.pretrain`` does the same with checkpoints, evaluations and metrics on the way.
+
+    Args:
+      dataset: trajectories of the world.
+      spec: the world's facts.
+      config: how to train (default: that of ``TrainConfig``).
+      **network: sizes and options of the network that differ from ``TransformerConfig``'s defaults.
+
+    Raises:
+      DataError: if the dataset does not fit the world.
+      UsageError: if a setting is out of its bounds.
+    """
+    config = config or TrainConfig()
+    check_dataset(dataset, "dataset", spec)
+    sizes = network_config(spec, **{"dropout": 0.0, **network})
+    mesh = device_mesh(largest_divisor(config.part_size, len(jax.devices())))
+    trainer = Trainer(config, sizes, dataset, mesh)
+    state = trainer.init()
+    batches = batch_stream(config, dataset, spec.truncate_in_hindsight, mesh.devices.size)
+    for _ in tqdm(range(config.steps), unit="step", disable=None):
+        state, _ = trainer.step(state, next(batches))
+    return LoadedPolicy(sizes, state.params, {"steps": config.steps})
