@@ -1,25 +1,26 @@
-"""Figures of every world: curves of adaptation (figures 6 and 7 of the paper) and of pre-training."""
+"""Figures of every world: curves of adaptation (figures 6 and 7 of the paper) and of training."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from envs.render import INK
+from envs.drawing import INK
 from experiments.figures.style import METHODS, method_styles, styled
-from experiments.results import Results
-from mgpo_jax.errors import DataError
+
+if TYPE_CHECKING:
+    from experiments.store.results import Results
 
 
 @styled
 def learning_curve(results: Mapping[str, Results], title: str | None = None) -> Figure:
     """Figures 6 and 7: return of the optimized prompt over the episodes of adaptation.
 
-    Lines are means over tasks and seeds, bands the standard deviation over seeds.
+    Lines are means over tasks and seeds, bands the standard deviation over seeds. The line of the optimum
+    is drawn where the optimum is known.
     """
     figure = Figure(figsize=(4.8, 2.7), layout="constrained")
     ax = figure.add_subplot()
@@ -35,7 +36,7 @@ def learning_curve(results: Mapping[str, Results], title: str | None = None) -> 
         if len(by_seed) > 1:
             ax.fill_between(episodes, mean - std, mean + std, color=color, alpha=0.16, linewidth=0)
     optima = {round(float(result.optimal_returns.mean()), 6) for result in results.values()}
-    for index, optimum in enumerate(sorted(optima)):
+    for index, optimum in enumerate(sorted(filter(np.isfinite, optima))):
         label = "_" if index else "optimum"
         ax.axhline(
             optimum, color=INK, linestyle=(0, (4, 3)), linewidth=1.0, label=label, zorder=1.8
@@ -48,13 +49,9 @@ def learning_curve(results: Mapping[str, Results], title: str | None = None) -> 
 
 
 @styled
-def training_curve(metrics: Path) -> Figure:
-    """Losses of a pre-training run and its greedy returns on the way, from ``metrics.jsonl``."""
-    try:
-        rows = [json.loads(line) for line in metrics.read_text().splitlines()]
-        steps = [row["step"] for row in rows]
-    except (OSError, ValueError, TypeError, KeyError):
-        raise DataError(f"{metrics} is missing or not readable JSON lines") from None
+def training_curve(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Losses of a training run and its greedy returns on the way, from the rows of ``metrics.jsonl``."""
+    steps = [row["step"] for row in rows]
     figure = Figure(figsize=(6.4, 2.4), layout="constrained")
     panels = (
         ("loss", {"train/loss": "training", "val/loss": "held out"}),
@@ -66,7 +63,7 @@ def training_curve(metrics: Path) -> Figure:
             },
         ),
     )
-    colors = (METHODS["bpe"][1], METHODS["ucb"][1])
+    colors = (METHODS["bpe"].color, METHODS["ucb"].color)
     for ax, (ylabel, names) in zip(figure.subplots(1, 2), panels, strict=True):
         for (name, label), color in zip(names.items(), colors, strict=True):
             if any(name in row for row in rows):

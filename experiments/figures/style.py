@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from functools import wraps
 from itertools import cycle
-from typing import Any, ParamSpec
+from typing import Any, NamedTuple, ParamSpec
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from envs.render import INK
+from envs.drawing import INK
 
 STYLE: dict[Any, Any] = {
     "figure.dpi": 150,
@@ -34,20 +34,31 @@ STYLE: dict[Any, Any] = {
     "lines.markersize": 4,
 }
 
-# Method -> (name in legends, color, line style, marker).
+
+class Look(NamedTuple):
+    """How a method looks in figures."""
+
+    name: str
+    """In legends."""
+    color: str
+    line: str
+    marker: str
+
+
 METHODS = {
-    "ucb": ("MGPO-UCB", "#D55E00", "-", "o"),
-    "bpe": ("MGPO-BPE", "#0072B2", "-", "s"),
-    "explore": ("MGPO-explore", "#009E73", "-", "^"),
-    "grips": ("GRIPS", "#CC79A7", "--", "D"),
-    "bbt": ("BBT", "#56B4E9", "--", "v"),
+    "ucb": Look("MGPO-UCB", "#D55E00", "-", "o"),
+    "bpe": Look("MGPO-BPE", "#0072B2", "-", "s"),
+    "explore": Look("MGPO-explore", "#009E73", "-", "^"),
+    "grips": Look("GRIPS", "#CC79A7", "--", "D"),
+    "bbt": Look("BBT", "#56B4E9", "--", "v"),
+    "gcbc": Look("GC-BC", "#6B6B6B", ":", "P"),
 }
-# For labels that are no methods: all colors with solid lines, then all with dashed ones.
-SPARE_COLORS = ("#E69F00", "#6B6B6B", "#8C510A", "#5E3C99", "#B2182B", "#003C30", "#35978F")
+# For methods without a look of their own: all colors with solid lines, then all with dashed ones.
+SPARE_COLORS = ("#E69F00", "#8C510A", "#5E3C99", "#B2182B", "#003C30", "#35978F")
 SPARE_STYLES = [
     (color, line, marker)
     for line in ("-", "--")
-    for color, marker in zip(SPARE_COLORS, "os^DvPX", strict=True)
+    for color, marker in zip(SPARE_COLORS, "os^DvX", strict=True)
 ]
 
 Args = ParamSpec("Args")
@@ -64,16 +75,16 @@ def styled(draw: Callable[Args, Figure]) -> Callable[Args, Figure]:
     return wrapper
 
 
-def method_styles(labels: Iterable[str]) -> dict[str, tuple[str, str, Any, str]]:
-    """(legend, color, line style, marker) of each label, a method's name or "name (remark)"."""
-    styles: dict[str, tuple[str, str, Any, str]] = {}
+def method_styles(labels: Iterable[str]) -> dict[str, Look]:
+    """The look of each label, which is the name of a method or "name (remark)"."""
+    looks: dict[str, Look] = {}
     taken: set[str] = set()
     spare = cycle(SPARE_STYLES)
     for label in labels:
         method, _, remark = label.partition(" ")
-        name, color, line, marker = METHODS.get(method, (method, "", "", ""))
-        if color in taken or not color:
-            color, line, marker = next(spare)
-        taken.add(color)
-        styles[label] = (f"{name} {remark}".strip(), color, line, marker)
-    return styles
+        look = METHODS.get(method, Look(method, "", "", ""))
+        if look.color in taken or not look.color:
+            look = Look(look.name, *next(spare))
+        taken.add(look.color)
+        looks[label] = look._replace(name=f"{look.name} {remark}".strip())
+    return looks

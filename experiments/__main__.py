@@ -1,0 +1,38 @@
+"""The console script ``mgpo``: ``mgpo adapt FLAGS`` is ``python -m experiments.adapt FLAGS``."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+from envs.errors import nearest
+
+COMMANDS = {
+    "list": "the worlds and methods there are",
+    "collect": "collect a dataset of demonstrations",
+    "pretrain": "pre-train a policy",
+    "adapt": "adapt a policy to unseen tasks",
+    "evaluate": "evaluate optimized prompts once more, under noise or in another world",
+    "table": "compare adaptations in one table",
+    "plot": "draw figures of adaptations",
+    "reproduce": "make an ablation of the paper",
+    "release": "package a pre-training run as a released policy",
+    "bench": "measure speed in CPU time",
+}
+
+
+def main() -> None:
+    """Run the command that the first word of the command line names."""
+    words = sys.argv[1:]
+    if not words or words[0] in ("-h", "--help"):
+        print("usage: mgpo COMMAND [FLAGS]; `mgpo COMMAND --help` shows the flags\n")
+        print("\n".join(f"  {name:<10} {text}" for name, text in COMMANDS.items()))
+        sys.exit(0)
+    if words[0] not in COMMANDS:
+        print(f"error: {nearest(words[0], COMMANDS, 'command')}", file=sys.stderr)
+        sys.exit(2)
+    importlib.import_module(f"experiments.{words[0]}").command(words[1:])
+
+
+if __name__ == "__main__":
+    main()

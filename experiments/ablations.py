@@ -1,0 +1,217 @@
+"""The paper's ablations: what is trained, what is adapted, and the lines of the tables."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import envs
+from envs.errors import UsageError, nearest
+from experiments.adapt import AdaptConfig
+from experiments.adaptation import adapt_all, save_outcome
+from experiments.figures import learning_curve
+from experiments.reproduce import ReproduceConfig
+from experiments.store.paper import paper_value
+from experiments.store.policies import check_weights
+from experiments.store.results import load_results, read_summary
+from experiments.store.settings import DataConfig, pretrain_preset
+from experiments.store.tables import number, table
+from experiments.training import train
+from mgpo_jax.distributions import HEADS
+from mgpo_jax.methods import UcbHyper
+from mgpo_jax.policy_files import load_policy
+from mgpo_jax.tasks import test_tasks
+
+EPISODES = 100  # of an adaptation
+LONGEST = 5  # goals of a prompt where the paper varies c
+
+
+class Line(NamedTuple):
+    """One row of a table: its results, and what the paper has for it."""
+
+    label: str
+    results: Path
+    paper: str
+
+
+def trained(
+    config: ReproduceConfig, label: str, demonstrator: str | None = None, **changes: Any
+) -> Path:
+    """The policy of one training, which is run or continued if it is not finished.
+
+    Args:
+      config: settings of the command.
+      label: what the run's folder is named after, beside its size.
+      demonstrator: whose dataset (default: that of the world's recipe).
+      **changes: what else differs from the world's ``PretrainConfig``.
+    """
+    fast = pretrain_preset(config.env, "fast")
+    settings = replace(
+        fast,
+        data=DataConfig(demonstrator or fast.data.demonstrator, config.num_trajectories),
+        train=replace(fast.train, steps=config.num_steps),
+        **changes,
+    )
+    size = f"{config.num_steps}steps-{config.num_trajectories}episodes"
+    folder = config.folder / "policies" / f"{label}-k{settings.max_prompt_length}-{size}"
+    if not (folder / "policy").is_dir():
+        print(f"training {folder}", file=sys.stderr)
+        train(replace(settings, out=folder, resume=folder.exists()))
+    return folder / "policy"
+
+
+def adapted(
+    config: ReproduceConfig, policy_folder: Path | None, folders: Mapping[Path, UcbHyper]
+) -> None:
+    """UCB with each variant of its settings, as one program; finished results stay as they are.
+
+    Args:
+      config: settings of the command.
+      policy_folder: folder of the policy; None for the released one.
+      folders: result folders to write, with the hyper-parameters of each.
+    """
+    world, env = envs.find(config.env), envs.make(config.env)
+    policy = load_policy(world, policy_folder)
+    missing = {folder: hyper for folder, hyper in folders.items() if not folder.exists()}
+    for folder in folders.keys() - missing.keys():
+        check_weights(load_results(folder), policy, f"remove {folder}")
+    if not missing:
+        return
+    tasks = test_tasks(world)
+    print(f"adapting with {policy_folder or 'the released policy'}", file=sys.stderr)
+    configs = [
+        AdaptConfig(
+            env=config.env,
+            policy=policy_folder,
+            seeds=config.seeds,
+            episodes=EPISODES,
+            out=folder,
+            hyper=hyper,
+        )
+        for folder, hyper in missing.items()
+    ]
+    outcomes = adapt_all(world, env, policy, tasks, configs)
+    for settings, outcome in zip(configs, outcomes, strict=True):
+        save_outcome(settings.folder, settings, env, policy, tasks, outcome)
+
+
+def table4(config: ReproduceConfig) -> list[Line]:
+    """Longest prompt K and exploration constant c, with the released policy (Table 4)."""
+    folder = config.folder / "table4"
+    lengths = {
+        folder / f"K{k}-{config.seeds}seeds": UcbHyper(max_goals=k) for k in (1, 2, 3, LONGEST)
+    }
+    constants = {  # Eq. 3 as printed
+        folder / f"c{c}-{config.seeds}seeds": UcbHyper(c=float(c), max_goals=LONGEST, scale=1.0)
+        for c in (0, 1, 10)
+    }
+    adapted(config, None, lengths)
+    adapted(config, None, constants)
+    lines = [(f"K = {hyper.max_goals}", path) for path, hyper in lengths.items()]
+    lines += [(f"c = {hyper.c:.0f}", path) for path, hyper in constants.items()]
+    return [Line(label, path, paper_value("table4", config.env, label)) for label, path in lines]
+
+
+def chosen(config: ReproduceConfig, names: Sequence[str]) -> Sequence[str]:
+    """Those of ``names`` that ``--only`` leaves."""
+    for name in config.only:
+        if name not in names:
+            raise nearest(name, names, f"row of {config.what}")
+    return config.only or names
+
+
+def compared(
+    config: ReproduceConfig,
+    names: Sequence[str],
+    policy_of: Callable[[str], Path],
+    label: str = "{}",
+) -> list[Line]:
+    """One policy, and one adaptation with it, for each of the names that ``--only`` leaves."""
+    lines = []
+    for name in chosen(config, names):
+        policy = policy_of(name)
+        results = config.folder / config.what / f"{policy.parent.name}-{config.seeds}seeds"
+        adapted(config, policy, {results: UcbHyper()})
+        paper = paper_value(config.what, config.env, name)
+        lines.append(Line(label.format(name), results, paper))
+    return lines
+
+
+def demonstrators(config: ReproduceConfig) -> list[str]:
+    """The names of the world's demonstrators, the default first."""
+    return list(envs.find(config.env).demonstrators(envs.make(config.env)))
+
+
+def table5(config: ReproduceConfig) -> list[Line]:
+    """One policy for each dataset (Table 5).
+
+    Raises:
+      UsageError: for a world with one demonstrator.
+    """
+    names = demonstrators(config)
+    if len(names) < 2:
+        raise UsageError(
+            f"there is no table5 for {config.env}: it compares datasets of several demonstrators"
+        )
+    return compared(config, sorted(names), lambda name: trained(config, name, name))
+
+
+def figure8(config: ReproduceConfig) -> list[Line]:
+    """One policy for each longest prompt K (Figure 8)."""
+    first = demonstrators(config)[0]
+    return compared(
+        config,
+        ("5", "10", "20", "40"),
+        lambda length: trained(config, first, first, max_prompt_length=int(length)),
+        "K = {}",
+    )
+
+
+def heads(config: ReproduceConfig) -> list[Line]:
+    """One policy for each distribution of continuous actions; the authors' code has the fixed Gaussian.
+
+    Raises:
+      UsageError: for a world with discrete actions.
+    """
+    if envs.make(config.env).spec.discrete:
+        raise UsageError(
+            f"there is no heads for {config.env}: it compares distributions of continuous actions"
+        )
+    names = [name for name in HEADS if name != "categorical"]
+    return compared(config, names, lambda head: trained(config, head, head=head))
+
+
+MAKE: dict[str, Callable[[ReproduceConfig], list[Line]]] = {
+    "table4": table4,
+    "table5": table5,
+    "figure8": figure8,
+    "heads": heads,
+}
+
+
+def as_table(lines: Sequence[Line]) -> str:
+    """The table in Markdown, one row for each line."""
+    head = ["", "initial", "final (mean ± std over seeds)", "regret", "after 40", "paper: final"]
+    rows = []
+    for line in lines:
+        summary = read_summary(line.results)
+        rows.append(
+            [
+                line.label,
+                f"{summary['initial_return']:.2f}",
+                f"{summary['final_return']:.3f} ± {summary['final_return_std_over_seeds']:.3f}",
+                number(summary["regret"]),
+                number(summary["regret_after_40"]),
+                line.paper,
+            ]
+        )
+    return table(head, rows)
+
+
+def draw(lines: Sequence[Line], title: str, path: Path) -> None:
+    """The learning curves of the lines."""
+    results = {line.label: load_results(line.results) for line in lines}
+    learning_curve(results, title).savefig(path)

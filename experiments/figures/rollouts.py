@@ -1,0 +1,341 @@
+"""Figures of prompts and of episodes under them, for every world that draws.
+
+The numbers are those of the paper's figures: 2 prompts, 3 and 10 how prompt and behavior evolve, 9 short
+and long prompts. A world draws what it offers in its ``Pictures``; figures that it does not offer are
+left out, and so are those of methods without prompts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from envs.base import Episode, Task
+from envs.drawing import Film, Pictures, Shown, Stage, observations, write_films
+from experiments.figures.style import method_styles, styled
+from mgpo_jax.prompts import sample_prompt
+
+if TYPE_CHECKING:
+    from experiments.store.results import Results
+
+NUM_ROLLOUTS = 64
+NUM_DRAWS = 64  # of which the longest prompt is taken
+STAGES = (1, 10, 20, 40, 100)  # episodes after which a search is drawn
+BAR_ROOM = 0.6  # inches of a color bar
+LEGEND_WIDTH = 5.0  # inches that a figure with a legend below it takes at least
+LABEL_ROOM = (0.9, 0.65)  # inches of the labels of rows, and of title and legend of a search
+FRAME_HEIGHT = 200  # pixels that small frames are enlarged to
+
+Save = Callable[[Path], object]
+"""Writes one picture to a path."""
+Play = Callable[[jax.Array, Task, np.ndarray, int, bool], Episode]
+"""``(key, task, goals [k, G], num, greedy) -> Episode`` with numpy leaves ``[num, ..]``: that many
+episodes on a task under a prompt."""
+
+
+def figures_of_run(
+    pictures: Pictures, result: Results, which: Sequence[int]
+) -> Iterator[tuple[str, Save]]:
+    """File name and writer of each figure that needs no policy, for some tasks of one adaptation."""
+    if _has_prompts(result):
+        if pictures.prompts:
+            yield "prompts.png", prompts(pictures, {result.method: result}, which).savefig
+        if pictures.search:
+            yield "search.png", search(pictures, result, which).savefig
+
+
+def figures_of_results(
+    pictures: Pictures,
+    results: Mapping[str, Results],
+    play_with: Callable[[Results], Play],
+    which: Sequence[int],
+    seed: int,
+) -> Iterator[tuple[str, Save]]:
+    """File name and writer of each figure of some adaptations to the same tasks.
+
+    Args:
+      pictures: what the world draws.
+      results: adaptations by their labels in legends, "method" or "method (remark)".
+      play_with: who plays the episodes of an adaptation.
+      which: the tasks to draw. Figures of one task and of one method show the first.
+      seed: which seed of the adaptations to draw.
+    """
+    results = {label: result for label, result in results.items() if _has_prompts(result)}
+    if not results:
+        return
+    if pictures.prompts:
+        yield "prompts.png", prompts(pictures, results, which, seed).savefig
+    key = jax.random.key(seed)
+    for number, (name, result) in enumerate(_file_names(results).items()):
+        if pictures.search:
+            yield f"{name}_search.png", search(pictures, result, which, seed).savefig
+        if not (pictures.visits or pictures.episodes or pictures.video or pictures.frame):
+            continue
+        play = play_with(result)
+        if pictures.visits:
+            if number == 0:
+                figure = short_and_long(pictures, result, play, which, key)
+                yield "short_and_long.png", figure.savefig
+            for task in which:
+                figure = evolution(pictures, result, play, task, seed, key)
+                yield f"{name}_evolution_task{task}.png", figure.savefig
+        if pictures.episodes:
+            yield f"{name}_episodes.png", episodes(pictures, result, play, which, seed, key).savefig
+        if pictures.video or pictures.frame:
+            save = partial(video, pictures, result, play, which[0], seed, key)
+            yield f"{name}_episode_task{which[0]}.gif", save
+
+
+@styled
+def prompts(
+    pictures: Pictures, results: Mapping[str, Results], which: Sequence[int], seed: int = 0
+) -> Figure:
+    """Figure 2: the final prompt of each method, in its color, on a few tasks."""
+    looks = method_styles(results)
+    tasks = _tasks_of(next(iter(results.values())), which)
+    by_color = [
+        {look.color: _best_goals(results[label], seed, index) for label, look in looks.items()}
+        for index in which
+    ]
+    figure, axes = _panels(pictures, 1, len(which), at_least=LEGEND_WIDTH)
+    pictures.prompts(axes, tasks, by_color)
+    handles = [
+        Line2D([], [], color=look.color, marker="o", linestyle="", markersize=6, label=look.name)
+        for look in looks.values()
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+    return figure
+
+
+@styled
+def search(
+    pictures: Pictures,
+    result: Results,
+    which: Sequence[int],
+    seed: int = 0,
+    stages: Sequence[int] = STAGES,
+) -> Figure:
+    """For each task the best prompt after some episodes, as rows.
+
+    Only stages at which the prompt was evaluated are drawn, and the last evaluation.
+    """
+    evaluated = result.eval_episodes.tolist()
+    stages = sorted({*stages, evaluated[-1]} & {*evaluated})
+    searches = [
+        [
+            Stage(
+                label=_count(stage, "episode"),
+                goals=_best_goals(result, seed, task, stage),
+                return_=float(result.eval_returns[seed, task, evaluated.index(stage)]),
+            )
+            for stage in stages
+        ]
+        for task in which
+    ]
+    longest = max(len(stage.goals) for rows in searches for stage in rows)
+    width, height = pictures.row(longest)
+    size = width * len(which) + LABEL_ROOM[0], height * (len(stages) + 1) + LABEL_ROOM[1]
+    figure = Figure(figsize=size, layout="compressed")
+    axes = list(figure.subplots(1, len(which), squeeze=False).flat)
+    pictures.search(axes, _tasks_of(result, which), searches)
+    for ax, task in zip(axes, which, strict=True):
+        ax.set_title(f"task {task}", pad=2, loc="left")
+    return figure
+
+
+@styled
+def evolution(
+    pictures: Pictures,
+    result: Results,
+    play: Play,
+    task: int,
+    seed: int,
+    key: jax.Array,
+    stages: Sequence[int] = STAGES,
+) -> Figure:
+    """Figures 3 and 10: the best prompt after some episodes, and where it leads the policy."""
+    shown = []
+    for stage in stages:
+        if stage <= result.returns.shape[2]:
+            goals = _best_goals(result, seed, task, stage)
+            played = play(key, result.task(task), goals, NUM_ROLLOUTS, False)
+            shown.append(Shown(_title(_count(stage, "episode"), played), goals, played))
+    figure, axes = _panels(pictures, 1, len(shown), BAR_ROOM)
+    _draw_visits(pictures, figure, axes, [result.task(task)] * len(shown), shown)
+    return figure
+
+
+@styled
+def short_and_long(
+    pictures: Pictures, result: Results, play: Play, which: Sequence[int], key: jax.Array
+) -> Figure:
+    """Figure 9: behavior under the task goal alone, and under the longest prompts.
+
+    Long prompts are drawn from the best of the trajectories above them.
+    """
+    above, below = [], []
+    for index, keys in zip(which, jax.random.split(key, (len(which), 3)), strict=True):
+        task, goal = result.task(index), result.task_goals[index]
+        explored = play(keys[0], task, goal[None], NUM_ROLLOUTS, False)
+        above.append(Shown(_title(_count(1, "goal"), explored), goal[None], explored))
+        goals = longest_prompt(keys[1], explored, goal, _num_slots(result))
+        played = play(keys[2], task, goals, NUM_ROLLOUTS, False)
+        below.append(Shown(_title(_count(len(goals), "goal"), played), goals, played))
+    figure, axes = _panels(pictures, 2, len(which), BAR_ROOM)
+    _draw_visits(pictures, figure, axes, 2 * _tasks_of(result, which), above + below)
+    return figure
+
+
+@styled
+def episodes(
+    pictures: Pictures,
+    result: Results,
+    play: Play,
+    which: Sequence[int],
+    seed: int,
+    key: jax.Array,
+) -> Figure:
+    """A greedy episode on each task under its optimized prompt."""
+    tasks, shown = _tasks_of(result, which), []
+    for index, task in zip(which, tasks, strict=True):
+        goals = _best_goals(result, seed, index)
+        played = _play_once(play, jax.random.fold_in(key, index), task, goals)
+        shown.append(Shown(_title(f"task {index}", played), goals, played))
+    figure, axes = _panels(pictures, 1, len(which), at_least=LEGEND_WIDTH)
+    pictures.episodes(axes, tasks, shown)
+    for ax, each in zip(axes, shown, strict=True):
+        ax.set_title(each.title, pad=2)
+    return figure
+
+
+def video(
+    pictures: Pictures,
+    result: Results,
+    play: Play,
+    index: int,
+    seed: int,
+    key: jax.Array,
+    path: Path,
+) -> None:
+    """A GIF of a greedy episode under the initial prompt, beside one under the optimized prompt."""
+    task = result.task(index)
+    named = {
+        "Initial prompt": result.task_goals[index][None],
+        "Optimized prompt": _best_goals(result, seed, index),
+    }
+    shown = []
+    for name, goals in named.items():
+        played = _play_once(play, jax.random.fold_in(key, index), task, goals)
+        title = f"{name}, return {_mean_return(played)}"
+        shown.append(Shown(title, goals, played))
+    if pictures.video:
+        pictures.video(path, task, shown)
+    elif pictures.frame:
+        write_films(path, [_film(pictures.frame, each) for each in shown])
+
+
+def longest_prompt(
+    key: jax.Array, episodes: Episode, goal: np.ndarray, max_goals: int
+) -> np.ndarray:
+    """The longest of some prompts ``[k, G]`` that are drawn from the best of a batch of episodes."""
+    best = int(np.argmax(episodes.return_))
+    reached = jax.tree.map(lambda leaf: jnp.asarray(leaf[best]), episodes.trajectory.goals)
+    draw = jax.jit(jax.vmap(lambda k: sample_prompt(k, reached, jnp.asarray(goal), max_goals)))
+    drawn = draw(jax.random.split(key, NUM_DRAWS))
+    mask = np.asarray(drawn.mask)
+    longest = int(mask.sum(axis=1).argmax())
+    return np.asarray(drawn.goals)[longest][mask[longest]]
+
+
+def _has_prompts(result: Results) -> bool:
+    return result.best_goals(0, 0) is not None
+
+
+def _num_slots(result: Results) -> int:
+    """How many goals the longest prompt of an adaptation may have."""
+    return result.best["prompt.goals"].shape[-2]
+
+
+def _best_goals(result: Results, seed: int, task: int, episodes: int | None = None) -> np.ndarray:
+    goals = result.best_goals(seed, task, episodes)
+    assert goals is not None  # figures of methods without prompts are left out
+    return goals
+
+
+def _file_names(results: Mapping[str, Results]) -> dict[str, Results]:
+    """Results by method, and number where one method ran more than once."""
+    names: dict[str, Results] = {}
+    for number, result in enumerate(results.values()):
+        method = result.method
+        names[f"{method}_{number}" if method in names else method] = result
+    return names
+
+
+def _tasks_of(result: Results, which: Sequence[int]) -> list[Task]:
+    return [result.task(index) for index in which]
+
+
+def _play_once(play: Play, key: jax.Array, task: Task, goals: np.ndarray) -> Episode:
+    return jax.tree.map(lambda leaf: leaf[0], play(key, task, goals, 1, True))
+
+
+def _panels(
+    pictures: Pictures, rows: int, columns: int, more: float = 0.0, at_least: float = 0.0
+) -> tuple[Figure, list[Axes]]:
+    """A figure with a panel for each picture, and ``more`` inches at its right; ``at_least`` so wide."""
+    width, height = pictures.panel
+    size = max(width * columns + more, at_least), height * rows
+    figure = Figure(figsize=size, layout="compressed")
+    return figure, list(figure.subplots(rows, columns, squeeze=False).flat)
+
+
+def _draw_visits(
+    pictures: Pictures,
+    figure: Figure,
+    axes: Sequence[Axes],
+    tasks: Sequence[Task],
+    shown: Sequence[Shown],
+) -> None:
+    """Where episodes went, below their titles and beside the scale of their colors."""
+    scale = pictures.visits(axes, tasks, shown)
+    for ax, each in zip(axes, shown, strict=True):
+        ax.set_title(each.title)
+    if scale is not None:
+        bar = figure.colorbar(
+            scale, ax=axes, label="visits in an episode", fraction=0.03, pad=0.01, aspect=25
+        )
+        bar.outline.set_visible(False)
+
+
+def _film(frame: Callable[[np.ndarray], np.ndarray], shown: Shown) -> Film:
+    """The film of an episode in a world that draws single observations."""
+    seen = observations(shown.episode)
+    scale = -(-FRAME_HEIGHT // len(frame(seen[0])))
+
+    def frames(times: np.ndarray) -> np.ndarray:
+        drawn = np.stack([np.asarray(frame(seen[time])) for time in times])
+        return drawn.repeat(scale, axis=1).repeat(scale, axis=2)
+
+    return Film(shown.title, len(seen), frames, lambda time: f"step {time}")
+
+
+def _title(what: str, episodes: Episode) -> str:
+    return f"{what}  (return {_mean_return(episodes)})"
+
+
+def _mean_return(episodes: Episode) -> str:
+    """Of one episode or several, for titles."""
+    return f"{np.mean(episodes.return_):.2f}".replace("-", "\N{MINUS SIGN}")
+
+
+def _count(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"

@@ -1,0 +1,249 @@
+"""What the bench measures: collection, training, acting and adaptation, in CPU time."""
+
+from __future__ import annotations
+
+import platform
+import resource
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, PRNGKeyArray
+
+import envs
+from envs.base import Environment, Episode, State, Task, TimeStep
+from envs.errors import UsageError
+from envs.registry import World
+from envs.wrappers import Wrapper
+from experiments.datasets import collect, find_demonstrator
+from experiments.store.settings import pretrain_preset
+from experiments.training import configured_network
+from mgpo_jax.dataset import BatchPlan, Dataset
+from mgpo_jax.policy import LoadedPolicy
+from mgpo_jax.policy_files import load_policy
+from mgpo_jax.prompts import Prompt, single_goal
+from mgpo_jax.rollout import Query, rollout
+from mgpo_jax.runner import adapt, cache_bytes, lanes_together, together
+from mgpo_jax.settings import TrainConfig
+from mgpo_jax.sharding import device_mesh, largest_divisor
+from mgpo_jax.tasks import benchmark_tasks
+from mgpo_jax.training import Trainer, batch_stream
+from mgpo_jax.transformer import TransformerConfig
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measured figure."""
+
+    name: str
+    value: float
+    unit: str
+    note: str = ""
+
+
+def measurements(
+    env_name: str, demonstrator: str | None, num_trajectories: int, quick: bool
+) -> Iterator[Row]:
+    """All rows of the bench for a world; ``quick`` does a tenth of the work."""
+    world, env = envs.find(env_name), envs.make(env_name)
+    note = "2048 x 2048, float32"
+    yield Row("matrix product", matrix_product_rate(), "GFLOP / CPU-s", note)
+    recipe = pretrain_preset(env_name, "fast")
+    name = demonstrator or recipe.data.demonstrator
+    dataset, row = bench_collect(world, env, name, num_trajectories)
+    yield row
+    network = configured_network(recipe, env, dataset)
+    yield from bench_gradient_step(recipe.train, network, env, dataset, 16 if quick else 64)
+    policy, note = policy_to_bench(world, recipe.train, network, dataset)
+    yield from bench_acting(env, policy, note)
+    yield bench_adaptation(world, env, policy, note, 20 if quick else 100)
+
+
+def cpu_time(work: Callable[[], Any]) -> tuple[Any, float]:
+    """Result and CPU-seconds of ``work``, which is run to the end."""
+    start = time.process_time()
+    result = jax.block_until_ready(work())
+    return result, time.process_time() - start
+
+
+def matrix_product_rate(size: int = 2048, repeats: int = 4) -> float:
+    """GFLOP per CPU-second of a large float32 product."""
+    matrix = jnp.ones((size, size))
+    product = jax.jit(lambda a: a @ a)
+    jax.block_until_ready(product(matrix))
+    _, cpu = cpu_time(lambda: [product(matrix) for _ in range(repeats)])
+    return repeats * 2 * size**3 / cpu / 1e9
+
+
+def sequence_flops(
+    config: TransformerConfig, num_goals: float, num_steps: np.ndarray
+) -> np.ndarray:
+    """FLOP of one forward pass over real tokens, what is not read out left aside.
+
+    Counted are the products of the layers as they stand: the last layer computes keys and values of
+    all tokens and the rest only where an action is read out, and attention its visible part.
+    """
+    width, steps = config.embed_dim, num_steps.astype(np.float64)
+    tokens = num_goals + 2 * steps - 1
+    full_layer = 24 * width**2 * tokens + 2 * width * tokens * (tokens + 1)
+    visible = steps * num_goals + steps**2  # keys visible from the observations
+    last_layer = 4 * width**2 * tokens + 20 * width**2 * steps + 4 * width * visible
+    obs_size = np.prod(config.obs_shape)
+    ends = 2 * width * (obs_size + 2 * config.action_dim) * steps
+    return (config.num_layers - 1) * full_layer + last_layer + ends
+
+
+def bench_collect(
+    world: World, env: Environment, name: str | None, num: int
+) -> tuple[Dataset, Row]:
+    """Demonstrations of ``name``, or of the world's first demonstrator."""
+    name, demonstrator = find_demonstrator(world, env, name)
+    collecting = partial(collect, env, demonstrator, num_test_tasks=world.num_test_tasks)
+    collecting(num=1, seed=1)  # compiles
+    (dataset, _), cpu = cpu_time(lambda: collecting(num=num, seed=0))
+    note = f"{name}, {num} kept, task generation included"
+    return dataset, Row("collection", num / cpu, "episodes / CPU-s", note)
+
+
+def bench_gradient_step(
+    config: TrainConfig,
+    network: TransformerConfig,
+    env: Environment,
+    dataset: Dataset,
+    num_steps: int,
+) -> Iterator[Row]:
+    """Gradient steps over the recipe's own stream of batches."""
+    mesh = device_mesh(largest_divisor(config.part_size, len(jax.devices())))
+    trainer = Trainer(config, network, dataset, mesh)
+    stream = batch_stream(config, dataset, env.spec.truncate_in_hindsight, mesh.devices.size)
+    batches = list(islice(stream, num_steps))
+
+    def steps(state: Any) -> Any:
+        for batch in batches:
+            state, metrics = trainer.step(state, batch)
+        return state.params, metrics
+
+    jax.block_until_ready(steps(trainer.init()))  # compiles every shape
+    state = trainer.init()
+    before = matrix_product_rate()
+    _, cpu = cpu_time(lambda: steps(state))
+    rate = (before + matrix_product_rate()) / 2
+    note = f"{config.batch_size} trajectories"
+    yield from _step_rows(network, batches, cpu, rate, note)
+
+
+def _step_rows(
+    network: TransformerConfig,
+    batches: list[list[BatchPlan]],
+    cpu: float,
+    rate: float,
+    note: str,
+) -> Iterator[Row]:
+    """What some gradient steps cost, and how much of it was of use."""
+    parts = [part for batch in batches for part in batch]
+    lengths = np.concatenate([part.lengths for part in parts])
+    padded = sum(len(part.lengths) * part.num_steps for part in parts)
+    longest = range(1, network.max_prompt_length + 1)
+    goals = np.mean([np.minimum(k, lengths).mean() for k in longest])
+    flops = 3 * sequence_flops(network, float(goals), lengths).sum()
+    note = f"{note}, mean {lengths.mean():.1f} steps"
+    yield Row("gradient step", cpu / len(batches), "CPU-s", note)
+    yield Row("  real steps", lengths.sum() / cpu, "steps / CPU-s", "padding not counted")
+    yield Row("  real tokens", flops / cpu / 1e9, "GFLOP / CPU-s", "padding not counted")
+    yield Row("  matrix product", rate, "GFLOP / CPU-s", "2048 x 2048, same run, before and after")
+    yield Row("  share of it", 100 * flops / cpu / 1e9 / rate, "%")
+    yield Row("  padding", 100 * (1 - lengths.sum() / padded), "%", "of the steps computed")
+    unit = 1e9 if platform.system() == "Darwin" else 1e6  # bytes there, kilobytes elsewhere
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+    yield Row("  peak memory", peak, "GB", "of the whole process so far")
+
+
+def policy_to_bench(
+    world: World, config: TrainConfig, network: TransformerConfig, dataset: Dataset
+) -> tuple[LoadedPolicy, str]:
+    """The released policy, or untrained weights where there is none."""
+    try:
+        return load_policy(world), "released policy"
+    except UsageError:
+        params = Trainer(config, network, dataset, device_mesh(1)).init().params
+        return LoadedPolicy(network, params, {}), "untrained policy"
+
+
+def bench_acting(env: Environment, policy: LoadedPolicy, note: str) -> Iterator[Row]:
+    """Time of one step of acting against the steps before it, and of a whole episode."""
+    lanes = lanes_together(env, cache_bytes(policy.config))
+    keys = jax.random.split(jax.random.key(0), lanes)
+    tasks = jax.vmap(env.sample_task)(keys)
+    slots = policy.config.max_prompt_length
+    prompts = jax.vmap(lambda task: single_goal(env.task_goal(task), slots))(tasks)
+    yield from _bench_decode(env, policy, keys, tasks, prompts)
+
+    endless = Endless(env)
+
+    def episode(key: PRNGKeyArray, task: Task, prompt: Prompt) -> Episode:
+        query = Query(prompt, jnp.ones((), bool))
+        return rollout(key, endless, policy.policy, task, query)
+
+    program = together(env, episode)
+    jax.block_until_ready(program(keys, tasks, prompts))
+    done, cpu = cpu_time(lambda: program(keys, tasks, prompts))
+    mean = float(done.trajectory.length.mean())
+    yield Row("full episode", cpu / lanes, "CPU-s", f"{note}, all {mean:.0f} steps of the horizon")
+
+
+def _bench_decode(
+    env: Environment, policy: LoadedPolicy, keys: PRNGKeyArray, tasks: Task, prompts: Prompt
+) -> Iterator[Row]:
+    """Time of one step of acting, at an eighth, half and the end of the horizon."""
+    horizon, lanes, functions = env.spec.horizon, len(keys), policy.policy
+    _, first = jax.vmap(env.reset)(keys, tasks)
+    _, carry = jax.jit(jax.vmap(functions.prefill))(prompts, first.obs)
+    action = jax.tree.map(lambda leaf: jnp.stack([leaf] * lanes), env.spec.zero_action())
+    for position in (horizon // 8, horizon // 2, horizon):
+        room = jax.vmap(lambda cache, n=position - 1: functions.grow(cache, n))(carry)
+        num_steps = min(16, position - 1)
+
+        @jax.jit
+        def decode(cache: Any, num_steps: int = num_steps) -> Any:
+            def step(cache: Any, _: None) -> tuple[Any, Any]:
+                distribution, cache = jax.vmap(functions.decode)(cache, action, first.obs)
+                return cache, distribution  # what is not returned is not computed either
+
+            return jax.lax.scan(step, cache, length=num_steps)
+
+        jax.block_until_ready(decode(room))
+        _, cpu = cpu_time(lambda decode=decode, room=room: decode(room))
+        cost = 1e3 * cpu / lanes / num_steps
+        yield Row(f"decode at {position}", cost, "CPU-ms / step", f"{lanes} episodes at once")
+
+
+class Endless(Wrapper):
+    """A world whose episodes last to the horizon."""
+
+    def reset(self, key: PRNGKeyArray, task: Task) -> tuple[State, TimeStep]:
+        state, timestep = self.env.reset(key, task)
+        return (jnp.zeros((), jnp.int32), state), timestep
+
+    def step(self, state: State, action: Array) -> tuple[State, TimeStep]:
+        steps, inner = state
+        inner, timestep = self.env.step(inner, action)
+        ends = steps + 1 >= self.spec.horizon
+        ongoing = timestep._replace(terminated=jnp.zeros((), bool), truncated=ends)
+        return (steps + 1, inner), ongoing
+
+
+def bench_adaptation(
+    world: World, env: Environment, policy: LoadedPolicy, note: str, episodes: int
+) -> Row:
+    """UCB on the world's test tasks."""
+    num = world.num_test_tasks
+    tasks = benchmark_tasks(env, num)
+    outcome = adapt(env, policy, tasks, "ucb", seeds=3, episodes=episodes, judged=world.judged)
+    note = f"{note}, {num} tasks x 3 seeds x {episodes} episodes"
+    return Row("adaptation", outcome.num_episodes / outcome.cpu_seconds, "episodes / CPU-s", note)

@@ -1,0 +1,25 @@
+"""The paper's numbers, which are data: by table, world and row."""
+
+from __future__ import annotations
+
+import tomllib
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+PAPER = Path(__file__).parent / "paper.toml"
+
+
+@cache
+def _numbers() -> dict[str, Any]:
+    return tomllib.loads(PAPER.read_text())
+
+
+def paper_rows(table: str, world: str) -> dict[str, Any]:
+    """The rows of a table for a world; none if the paper does not have them."""
+    return _numbers().get(table, {}).get(world, {})
+
+
+def paper_value(table: str, world: str, row: str) -> str:
+    """One number as the paper prints it; empty if it has none."""
+    return paper_rows(table, world).get(row, "")
