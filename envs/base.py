@@ -287,7 +287,8 @@ class Agent(NamedTuple):
     """``(memory, num_steps) -> memory`` with room for that many more steps."""
     decisions: Callable = lambda memory: ()
     """``(memory) -> decisions``: what it decided in the episode beside its actions, for agents whose
-    decisions last several steps."""
+    decisions last several steps. It is asked when all episodes of a batch have ended, and until then an
+    agent acts on: keep decisions by the step they were made in, of which the first ``length`` count."""
 
 
 class Demonstrator(NamedTuple):

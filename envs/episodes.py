@@ -110,7 +110,11 @@ def run_episode(key: PRNGKeyArray, env: Environment, agent: Agent, task: Task) -
 def replay(
     key: PRNGKeyArray, env: Environment, task: Task, actions: Array, length: Array
 ) -> Episode:
-    """The episode that had this ``key`` and these ``actions [T, ..]``, of which ``length`` are real."""
+    """The episode that had this ``key`` and these ``actions [T, ..]``, of which ``length`` are real.
+
+    The actions may be in the small integers in which logs keep them.
+    """
+    actions = actions.astype(env.spec.zero_action().dtype)
 
     def begin(key: PRNGKeyArray, task: Task, state: State, timestep: TimeStep) -> tuple:
         del key, task, state, timestep

@@ -7,6 +7,7 @@ A world is found under a name that it was registered with, under the name of an 
 from __future__ import annotations
 
 import importlib
+import math
 import os
 import sys
 from collections.abc import Callable, Mapping
@@ -35,6 +36,13 @@ class Judgement:
     temperature: float = 1.0
     episodes: int = 1
 
+    def __post_init__(self) -> None:
+        if not (0 < self.temperature < math.inf and self.episodes >= 1):
+            raise UsageError(
+                "policies are judged at a temperature above 0 in at least one episode, found temperature "
+                f"{self.temperature} and {self.episodes} episodes"
+            )
+
 
 def _no_demonstrators(env: Environment) -> Mapping[str, Demonstrator]:
     return {}
@@ -51,7 +59,8 @@ class World:
       demonstrators: the agents that can collect a dataset, by name; the first is the default. A world
         without any needs a dataset from elsewhere.
       presets: what the world's training settings change in the general ones, by preset (``fast``,
-        ``paper``, ``smoke``): names and values of settings of ``experiments.pretrain``.
+        ``paper``, ``smoke``): names and values of settings of ``experiments.pretrain``. ``ablation`` has
+        the steps and trajectories of the trainings of ``experiments.reproduce``.
       pictures: what the world draws; None draws learning curves only.
       policy_of: the world whose released policy and test tasks this one uses [its own].
       judged: how policies are judged here; every table follows it.

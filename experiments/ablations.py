@@ -10,14 +10,17 @@ from typing import Any, NamedTuple
 
 import envs
 from envs.errors import UsageError, nearest
-from experiments.adapt import AdaptConfig
 from experiments.adaptation import adapt_all, save_outcome
 from experiments.figures import learning_curve
-from experiments.reproduce import ReproduceConfig
 from experiments.store.paper import paper_value
 from experiments.store.policies import check_weights
 from experiments.store.results import load_results, read_summary
-from experiments.store.settings import DataConfig, pretrain_preset
+from experiments.store.settings import (
+    AdaptConfig,
+    DataConfig,
+    ReproduceConfig,
+    pretrain_preset,
+)
 from experiments.store.tables import number, table
 from experiments.training import train
 from mgpo_jax.distributions import HEADS

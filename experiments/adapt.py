@@ -5,59 +5,15 @@ from __future__ import annotations
 import dataclasses
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any, NoReturn
-
-import tyro
+from typing import NoReturn
 
 import envs
 from envs.errors import UsageError
-from experiments.runtime import Common, early_values, refuse_existing, run
-from experiments.store.settings import DEFAULT_WORLD, RUNS, file_name
+from experiments.runtime import early_values, refuse_existing, run
+from experiments.store.settings import DEFAULT_WORLD, AdaptConfig
 from mgpo_jax import methods
 from mgpo_jax.methods import Method, foreign_setting
-from mgpo_jax.settings import flag, number
-
-
-@dataclass(frozen=True)
-class AdaptConfig(Common):
-    """Settings of ``experiments.adapt``; values in brackets are the paper's."""
-
-    env: str = DEFAULT_WORLD
-    """The world, by name or as module:attribute (``python -m experiments.list`` shows the names)."""
-    method: Annotated[str, tyro.conf.arg(aliases=("--bandit",))] = "ucb"
-    """Who adapts, by name or as module:attribute (``python -m experiments.list`` shows the names)."""
-    policy: Path | None = None
-    """Folder of a policy (default: the released one of the world)."""
-    tasks: Path | None = None
-    """Your own tasks, an npz file with one array for each field of the world's task (default: the test
-    tasks of the world)."""
-    validation: bool = False
-    """Adapt to as many tasks that are no test tasks, to choose a method's settings by."""
-    seeds: int = number(3, at_least=1)
-    """Independent adaptations to each task [3]."""
-    episodes: int = number(100, at_least=1)
-    """Budget of episodes a task, the first evaluation of (g^M) included [100]."""
-    seed: int = 0
-    """Seed of the adaptations."""
-    eval_every: int = number(10, at_least=1)
-    """Episodes between evaluations of the best choice, which are outside of the budget."""
-    eval_episodes: int | None = number(None, at_least=1)
-    """Episodes that an evaluation averages (default: as the world's record says)."""
-    keep_actions: bool = False
-    """Also keep continuous actions in the results; discrete ones are always kept."""
-    out: Path | None = None
-    """Result folder (default: runs/adapt/ENV/METHOD-seedSEED)."""
-    figures: bool = True
-    """Draw the figures."""
-    hyper: Annotated[Any, tyro.conf.arg(name="")] = None
-    """Hyper-parameters of the method."""
-
-    @property
-    def folder(self) -> Path:
-        name = f"{file_name(self.method)}-seed{self.seed}"
-        return self.out or RUNS / "adapt" / file_name(self.env) / name
+from mgpo_jax.settings import flag
 
 
 def adapt_default(argv: Sequence[str]) -> AdaptConfig:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -13,6 +12,7 @@ import numpy as np
 from envs.base import Environment, Task
 from envs.registry import World
 from experiments.store.results import Results, results_of, save_results
+from experiments.store.settings import AdaptConfig
 from experiments.store.summary import summarize
 from mgpo_jax import methods
 from mgpo_jax.files import to_json
@@ -33,7 +33,7 @@ def adapt_all(
     env: Environment,
     policy: LoadedPolicy,
     tasks: Task,
-    configs: Sequence[Any],
+    configs: Sequence[AdaptConfig],
 ) -> list[Outcome]:
     """One outcome for each config; they may differ in the method's hyper-parameters only."""
     first = configs[0]
@@ -57,7 +57,7 @@ def adapt_all(
 
 def adapt_and_save(
     folder: Path,
-    config: Any,
+    config: AdaptConfig,
     world: World,
     env: Environment,
     policy: LoadedPolicy,
@@ -70,7 +70,7 @@ def adapt_and_save(
 
 def save_outcome(
     folder: Path,
-    config: Any,
+    config: AdaptConfig,
     env: Environment,
     policy: LoadedPolicy,
     tasks: Task,

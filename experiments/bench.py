@@ -19,6 +19,8 @@ from experiments.runtime import Common, run
 from experiments.store.settings import DEFAULT_WORLD
 from mgpo_jax.settings import number
 
+COLUMNS = (18, 10, 18, 0)  # widths of name, value, unit and note, which are printed one by one
+
 
 @dataclass(frozen=True)
 class BenchConfig(Common):
@@ -43,13 +45,15 @@ def main(config: BenchConfig) -> None:
     envs.find(config.env)
     from experiments.measurements import measurements
     from experiments.store.provenance import provenance
+    from experiments.store.tables import aligned
     from mgpo_jax.files import write_json
 
     rows = []
     num = config.trajectories or (500 if config.quick else 5_000)
     for row in measurements(config.env, config.demonstrator, num, config.quick):
         rows.append(row)
-        print(f"{row.name:<18} {row.value:>10.3f} {row.unit:<18} {row.note}", flush=True)
+        cells = (row.name, f"{row.value:>10.3f}", row.unit, row.note)
+        print(aligned(cells, COLUMNS), flush=True)
     if config.json:
         write_json(config.json, {"env": config.env, "rows": rows, **provenance()})
         print(f"rows in {config.json}", file=sys.stderr)

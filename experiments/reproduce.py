@@ -9,58 +9,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, NoReturn
-
-import tyro
+from typing import NoReturn
 
 import envs
 from envs.errors import nearest
-from experiments.runtime import Common, run
-from experiments.store.settings import DEFAULT_WORLD, RUNS, file_name, pretrain_preset
-from mgpo_jax.settings import number
+from experiments.runtime import run
+from experiments.store.settings import ReproduceConfig
 
 ABLATIONS = ("table4", "table5", "figure8", "heads")
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReproduceConfig(Common):
-    """Settings of ``experiments.reproduce``."""
-
-    what: tyro.conf.Positional[str]
-    """table4 (prompt length and c of UCB), table5 (datasets), figure8 (longer prompts) or heads
-    (distributions of continuous actions)."""
-    env: str = DEFAULT_WORLD
-    """The world, by name or as module:attribute."""
-    only: tuple[str, ...] = ()
-    """Names of the datasets (table5), prompt lengths (figure8) or heads to train (default: all)."""
-    steps: int | None = number(None, at_least=1)
-    """Gradient steps of each training (default: those of the world's preset "ablation")."""
-    trajectories: Annotated[int | None, tyro.conf.arg(aliases=("--episodes",))] = number(
-        None, at_least=1
-    )
-    """Trajectories of each dataset (default: those of the world's preset "ablation")."""
-    seeds: int = number(3, at_least=1)
-    """Independent adaptations to each test task [3]."""
-    out: Path = RUNS / "reproduce"
-    """Folder of all trainings and results; tables share what they have in common."""
-
-    @property
-    def folder(self) -> Path:
-        return self.out / file_name(self.env)
-
-    @property
-    def num_steps(self) -> int:
-        return self.steps or self._preset("steps", pretrain_preset(self.env, "fast").train.steps)
-
-    @property
-    def num_trajectories(self) -> int:
-        default = pretrain_preset(self.env, "fast").data.trajectories
-        return self.trajectories or self._preset("trajectories", default)
-
-    def _preset(self, name: str, default: int) -> int:
-        return envs.find(self.env).presets.get("ablation", {}).get(name, default)
 
 
 def main(config: ReproduceConfig) -> None:

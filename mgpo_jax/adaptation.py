@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, Shaped
 
 from envs.base import Agent, Environment, EnvSpec, Episode, Goals, Task
 from envs.episodes import run_episode
+from mgpo_jax.trees import choose, put_row
 
 
 class Adapter(NamedTuple):
@@ -161,12 +162,7 @@ def proceed(
 
     def body(index: Array, carry: tuple[AdaptState, AdaptLog]) -> tuple[AdaptState, AdaptLog]:
         state, row = entry(carry[0], index)
-        rows = jax.tree.map(
-            lambda rows, row: jax.lax.dynamic_update_index_in_dim(rows, row, index, 0),
-            carry[1],
-            row,
-        )
-        return state, rows
+        return state, put_row(carry[1], row, index)
 
     state, log = jax.lax.fori_loop(0, num_rounds + num_judged, body, (state, blank))
     judged = Judged(jnp.float32(jnp.nan), jnp.int32(0))
@@ -191,20 +187,22 @@ def _round(
     """One round of the search, or (not ``searching``) one judging episode, which changes nothing."""
     key, key_ask, key_run, key_tell = jax.random.split(state.key, 4)
     choice, asked = adapter.ask(key_ask, state.search)
-    if judge_key is not None:
-        choice, asked = _choose(
-            searching, (choice, asked), (adapter.best(state.search), state.search)
-        )
-        key, key_run = _choose(searching, (key, key_run), (state.key, judge_key))
-    agent = adapter.agent(asked, choice)
     num = adapter.episodes_per_round
     keys = key_run[None] if num == 1 else jax.random.split(key_run, num)
+    if judge_key is not None:
+        choice, asked = choose(
+            searching, (choice, asked), (adapter.best(state.search), state.search)
+        )
+        # The same judging episodes for every method, however many episodes its rounds have.
+        judge_keys = jnp.broadcast_to(judge_key, keys.shape)
+        key, keys = choose(searching, (key, keys), (state.key, judge_keys))
+    agent = adapter.agent(asked, choice)
     wanted = jnp.where(searching, num, 1)
     episodes = _episodes(keys, env, agent, task, wanted)
 
     def told() -> Any:
-        tell = jax.custom_batching.sequential_vmap(adapter.tell)
-        return (tell if adapter.tell_in_turn else adapter.tell)(key_tell, asked, choice, episodes)
+        tell = in_turn(adapter.tell) if adapter.tell_in_turn else adapter.tell
+        return tell(key_tell, asked, choice, episodes)
 
     after = told() if judge_key is None else jax.lax.cond(searching, told, lambda: state.search)
     kept = env.spec.discrete or keep_actions
@@ -222,6 +220,26 @@ def _round(
     return AdaptState(key, after), log
 
 
+def in_turn(function: Callable) -> Callable:
+    """The same function, which ``vmap`` computes for one lane after the other.
+
+    What it closes over becomes an argument: ``sequential_vmap`` by itself accepts nothing there that
+    differs between lanes, such as the hyper-parameters of a sweep.
+    """
+
+    def call(*args: Any) -> Any:
+        closed, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
+
+        @jax.custom_batching.sequential_vmap
+        def run(consts: list[Any], leaves: list[Any]) -> list[Any]:
+            return jax.core.eval_jaxpr(closed.jaxpr, consts, *leaves)
+
+        leaves = run(closed.consts, jax.tree.leaves(args))
+        return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
+
+    return call
+
+
 def _episodes(
     keys: Key[Array, "K"], env: Environment, agent: Agent, task: Task, wanted: Int[Array, ""]
 ) -> Episode:
@@ -233,10 +251,7 @@ def _episodes(
     blank = jax.tree.map(lambda leaf: _zeros((len(keys), *leaf.shape), leaf.dtype), shapes)
 
     def body(index: Array, rows: Episode) -> Episode:
-        one = run_episode(keys[index], env, agent, task)
-        return jax.tree.map(
-            lambda rows, row: jax.lax.dynamic_update_index_in_dim(rows, row, index, 0), rows, one
-        )
+        return put_row(rows, run_episode(keys[index], env, agent, task), index)
 
     return jax.lax.fori_loop(0, wanted, body, blank)
 
@@ -253,10 +268,6 @@ def small_actions(spec: EnvSpec, episodes: Episode) -> Array:
     dtype = jnp.uint8 if spec.action_dim <= 255 else jnp.uint16
     real = jnp.arange(actions.shape[-1]) < episodes.trajectory.length[..., None]
     return jnp.where(real, actions, jnp.iinfo(dtype).max).astype(dtype)
-
-
-def _choose(condition: Bool[Array, ""], if_true: Any, if_false: Any) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), if_true, if_false)
 
 
 def _zeros(shape: tuple[int, ...], dtype: Any) -> Array:

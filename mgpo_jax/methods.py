@@ -116,14 +116,14 @@ def foreign_setting(name: str, method: Method) -> UsageError:
     return UsageError(f"--{name.replace('_', '-')} is no setting of {method.name}{hint}")
 
 
-def split_hyper(hypers: Sequence[Any]) -> tuple[Any, dict[str, list[float]]]:
+def split_hyper(hypers: Sequence[Any]) -> tuple[Any, dict[str, list[int | float]]]:
     """Hyper-parameters of several variants as one static record and the numbers that are data.
 
     Raises:
       UsageError: if the variants differ in a setting that decides about shapes.
     """
     first = hypers[0]
-    numbers: dict[str, list[float]] = {}
+    numbers: dict[str, list[int | float]] = {}
     for field in dataclasses.fields(first):
         values = [getattr(hyper, field.name) for hyper in hypers]
         numeric = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)

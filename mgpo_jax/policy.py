@@ -6,6 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from envs.base import EnvSpec
+from envs.errors import DataError
 from mgpo_jax.transformer import GoalTransformer, TransformerConfig, grow_cache
 
 
@@ -37,6 +39,23 @@ class LoadedPolicy(NamedTuple):
     def policy(self) -> Policy:
         """The network as functions that act."""
         return transformer_policy(self.config, self.params)
+
+
+def check_fits(config: TransformerConfig, spec: EnvSpec, who: str = "the policy") -> None:
+    """Raise ``DataError`` if a network was made for another world than that of ``spec``."""
+    facts = {
+        "discrete actions": (config.head == "categorical", spec.discrete),
+        "obs_shape": (config.obs_shape, spec.obs.shape),
+        "obs_dtype": (config.obs_dtype, spec.obs.dtype),
+        "goal_dim": (config.goal_dim, spec.goal_dim),
+        "action_dim": (config.action_dim, spec.action_dim),
+        "horizon": (config.horizon, spec.horizon),
+    }
+    for field, (found, want) in facts.items():
+        if found != want:
+            raise DataError(
+                f"{who} has {field} {found}, {spec.name} needs {want}: it was trained for another world"
+            )
 
 
 def transformer_policy(config: TransformerConfig, params: Any) -> Policy:

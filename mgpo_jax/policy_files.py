@@ -22,7 +22,7 @@ from envs.registry import World, find
 from mgpo_jax.distributions import HEADS
 from mgpo_jax.encoders import ENCODERS
 from mgpo_jax.files import hash_file, load_arrays, read_object
-from mgpo_jax.policy import LoadedPolicy
+from mgpo_jax.policy import LoadedPolicy, check_fits
 from mgpo_jax.prompts import single_goal
 from mgpo_jax.transformer import GoalTransformer, TransformerConfig
 
@@ -92,7 +92,7 @@ def read_policy(folder: Path, spec: EnvSpec | None = None) -> LoadedPolicy:
     flat = load_arrays(path)
     _check_weights(path, flat, flatten_dict(_shapes(config), sep="/"))
     if spec is not None:
-        _check_world(folder, config, spec)
+        check_fits(config, spec, f"the policy in {folder}")
     params = jax.tree.map(jnp.asarray, unflatten_dict(flat, sep="/"))
     return LoadedPolicy(config, params, document["made"], document["sha256"], folder)
 
@@ -139,24 +139,6 @@ def _check_weights(path: Path, flat: dict[str, np.ndarray], expected: dict[str, 
             raise DataError(f"{path}: weight {name} has shape {found}, the network needs {want}")
         if not np.isfinite(flat[name]).all():
             raise DataError(f"{path}: weight {name} holds NaN or infinity")
-
-
-def _check_world(folder: Path, config: TransformerConfig, spec: EnvSpec) -> None:
-    """Raise ``DataError`` if a network was made for another world."""
-    facts = {
-        "discrete actions": (config.head == "categorical", spec.discrete),
-        "obs_shape": (config.obs_shape, spec.obs.shape),
-        "obs_dtype": (config.obs_dtype, spec.obs.dtype),
-        "goal_dim": (config.goal_dim, spec.goal_dim),
-        "action_dim": (config.action_dim, spec.action_dim),
-        "horizon": (config.horizon, spec.horizon),
-    }
-    for field, (found, want) in facts.items():
-        if found != want:
-            raise DataError(
-                f"the policy in {folder} has {field} {found}, {spec.name} needs {want}: "
-                "it was trained for another world"
-            )
 
 
 def _shapes(config: TransformerConfig) -> Any:

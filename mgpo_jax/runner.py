@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -33,7 +33,7 @@ from mgpo_jax.adaptation import (
     start,
 )
 from mgpo_jax.methods import Method, Setting, find, split_hyper, with_numbers
-from mgpo_jax.policy import LoadedPolicy, transformer_policy
+from mgpo_jax.policy import LoadedPolicy, check_fits, transformer_policy
 from mgpo_jax.rollout import Query, rollout
 from mgpo_jax.sharding import AXIS, device_mesh, fetch, replicate, split
 from mgpo_jax.tasks import num_tasks
@@ -150,9 +150,14 @@ def sweep(
       keep_actions: whether to keep continuous actions; discrete ones are always kept.
 
     Raises:
-      UsageError: if the method cannot be used in this setting.
+      UsageError: if a number is below 1, or the method cannot be used in this setting.
+      DataError: if the policy was made for another world.
     """
+    for name, value in {"seeds": seeds, "episodes": episodes, "eval_every": eval_every}.items():
+        if value < 1:
+            raise UsageError(f"{name} must be at least 1, found {value}")
     network, params = policy.config, policy.params
+    check_fits(network, env.spec)
     setting = Setting(env, network, episodes, judged or Judgement())
     for hyper in hypers:
         method.check_use(setting, hyper)
@@ -224,7 +229,7 @@ class Grid:
         return self.variants * self.seeds * self.tasks
 
     def lanes(
-        self, layout: Layout, tasks: Task, seed: int, numbers: dict[str, list[float]]
+        self, layout: Layout, tasks: Task, seed: int, numbers: dict[str, list[int | float]]
     ) -> Lanes:
         """The lanes; those beyond the last variant repeat the first ones to fill up a group."""
         index = np.arange(layout.num_lanes)
@@ -452,6 +457,7 @@ def evaluate(
     The second result is how many episodes a broken world ended.
     """
     network = policy.config
+    check_fits(network, env.spec)
     seeds, num = queries.prompt.mask.shape[:2]
     grid = Grid(variants=1, seeds=seeds, tasks=num)
 

@@ -40,8 +40,8 @@ GRIDWORLD = World(
     demonstrators=load_demonstrators,
     presets={
         # Each of the 13,600 training tasks five times.
-        "fast": {"steps": 3_000, "episodes": 68_000, "max_prompt_length": 8, "bucket": 8},
-        "paper": {"steps": 50_000, "episodes": 13_600, "max_prompt_length": 8, "bucket": 8},
+        "fast": {"steps": 3_000, "trajectories": 68_000, "max_prompt_length": 8, "bucket": 8},
+        "paper": {"steps": 50_000, "trajectories": 13_600, "max_prompt_length": 8, "bucket": 8},
     },
     pictures=load_pictures,
     # Episodes start on a random cell, so one return says little about a prompt.

@@ -79,7 +79,7 @@ KITCHEN = World(
         # Trajectories are long, so that 32 of them are enough for a gradient step.
         "fast": {
             "steps": 5_000,
-            "episodes": 9_000,
+            "trajectories": 9_000,
             "max_prompt_length": 6,
             "bucket": 32,
             "batch_size": 32,
@@ -90,11 +90,12 @@ KITCHEN = World(
         },
         "paper": {
             "steps": 200_000,
-            "episodes": 9_000,
+            "trajectories": 9_000,
             "max_prompt_length": 6,
             "bucket": 32,
             "head": "fixed_gaussian",
         },
+        "ablation": {"steps": 1_000, "trajectories": 9_000},
     },
     pictures=load_pictures,
     num_test_tasks=25,

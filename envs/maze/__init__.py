@@ -47,8 +47,9 @@ MAZE15 = World(
     demonstrators=load_demonstrators,
     presets={
         # 10,000 trajectories are soon overfitted; 100,000 are not, and take a minute to collect.
-        "fast": {"steps": 8_000, "episodes": 100_000},
-        "paper": {"steps": 50_000, "episodes": 10_000},  # steps as in the authors' code
+        "fast": {"steps": 8_000, "trajectories": 100_000},
+        "paper": {"steps": 50_000, "trajectories": 10_000},  # steps as in the authors' code
+        "ablation": {"steps": 2_000, "trajectories": 10_000},
     },
     pictures=load_pictures,
 )
@@ -61,13 +62,14 @@ MAZE30 = World(
     presets={
         "fast": {
             "steps": 5_000,
-            "episodes": 30_000,
+            "trajectories": 30_000,
             "max_prompt_length": 20,
             "bucket": 32,
             "demonstrator": "astar2",
             "save_every": 250,
         },
-        "paper": {"steps": 200_000, "episodes": 10_000, "bucket": 32},
+        "paper": {"steps": 200_000, "trajectories": 10_000, "bucket": 32},
+        "ablation": {"steps": 1_000, "trajectories": 10_000},
     },
     pictures=load_pictures,
 )

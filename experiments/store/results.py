@@ -28,6 +28,7 @@ from experiments.store.provenance import provenance
 from mgpo_jax.files import load_arrays, new_folder, read_object, write_json
 from mgpo_jax.runner import Outcome, Reached
 from mgpo_jax.tasks import save_tasks, task_arrays, task_at, tasks_from
+from mgpo_jax.trees import named_leaves
 
 FORMAT = 2  # 1 had only prompts as choices, and neither actions nor reached goals
 ARRAYS, TASKS, CONFIG, META, SUMMARY = (
@@ -41,7 +42,8 @@ OLD_NAMES = {
     "best_goals": "best.prompt.goals",
     "best_masks": "best.prompt.mask",
 }
-# Axes: S seeds, N tasks, E episodes, R rounds, T steps, G goal size, C judgements, U different goals.
+# Axes: S seeds, N tasks, E episodes, R rounds, P slots of a prompt, T steps, G goal size, C judgements,
+# L reached goals, U different ones.
 AXES = {
     "returns": "SNE",
     "eval_episodes": "C",
@@ -54,6 +56,10 @@ AXES = {
     "reached_steps": "L",
     "reached_index": "L",
     "reached_table": "UG",
+    "choice.prompt.goals": "SNRPG",
+    "choice.prompt.mask": "SNRP",
+    "best.prompt.goals": "SNRPG",
+    "best.prompt.mask": "SNRP",
 }
 REQUIRED = ("returns", "eval_episodes", "eval_returns")
 
@@ -105,7 +111,7 @@ class Results:
     @cached_property
     def task_set(self) -> Task:
         """The tasks as the world's record."""
-        return tasks_from(self.tasks, envs.make(self.env), "the tasks of the results")
+        return tasks_from(self.tasks, envs.make(self.env), "the tasks of the results", trusted=True)
 
     @cached_property
     def task_goals(self) -> np.ndarray:
@@ -157,11 +163,7 @@ def results_of(
 
 
 def _parts(choice: Any) -> dict[str, np.ndarray]:
-    paths, _ = jax.tree_util.tree_flatten_with_path(choice)
-    return {
-        jax.tree_util.keystr(path, simple=True, separator=".") or "choice": np.asarray(leaf)
-        for path, leaf in paths
-    }
+    return {name: np.asarray(leaf) for name, leaf in named_leaves(choice, "choice").items()}
 
 
 def save_results(folder: Path, results: Results) -> None:
@@ -239,7 +241,7 @@ def load_results(folder: Path) -> Results:
         optimal_returns=arrays.get("optimal_returns", np.full(sizes["N"], np.nan)),
         keys=arrays.get("keys"),
         actions=arrays.get("actions"),
-        reached=_expand(arrays),
+        reached=_expand(arrays, where),
         summary=read_object(folder / SUMMARY),
     )
     if "task_goals" in arrays:
@@ -254,13 +256,11 @@ def read_summary(folder: Path) -> dict[str, Any]:
 
 def _check_arrays(arrays: Mapping[str, np.ndarray], where: Path) -> dict[str, int]:
     """Raise ``DataError`` if arrays are missing or do not fit together; returns the sizes of the axes."""
-    if missing := [name for name in REQUIRED if name not in arrays]:
+    if missing := [name for name in (*REQUIRED, *_expected_parts(arrays)) if name not in arrays]:
         raise DataError(f"{where} lacks {', '.join(missing)}")
     parts = [name for name in arrays if name.startswith(("choice.", "best."))]
-    if not any(name.startswith("best.") for name in parts):
-        raise DataError(f"{where} lacks the best choices (best.*)")
-    axes_of = {**{name: axes for name, axes in AXES.items() if name in arrays},
-               **dict.fromkeys(parts, "SNR*")}  # fmt: skip
+    axes_of = dict.fromkeys(parts, "SNR*")
+    axes_of |= {name: axes for name, axes in AXES.items() if name in arrays}
     sizes: dict[str, int] = {}
     for name, axes in axes_of.items():
         shape, wanted = arrays[name].shape, axes.removesuffix("*")
@@ -280,6 +280,13 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], where: Path) -> dict[str, in
     return sizes
 
 
+def _expected_parts(arrays: Mapping[str, np.ndarray]) -> list[str]:
+    """Names of the parts of choices: who acted and the best choice have the same ones."""
+    parts = {*_with_prefix(arrays, "choice."), *_with_prefix(arrays, "best.")} or {"*"}
+    expected = [f"{prefix}{part}" for prefix in ("choice.", "best.") for part in sorted(parts)]
+    return [name for name in expected if name != "best.greedy"]  # which format 1 did not keep
+
+
 def _with_prefix(arrays: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
     return {
         name.removeprefix(prefix): array
@@ -288,9 +295,15 @@ def _with_prefix(arrays: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.
     }
 
 
-def _expand(arrays: Mapping[str, np.ndarray]) -> Reached | None:
+def _expand(arrays: Mapping[str, np.ndarray], where: Path) -> Reached | None:
     """Reached goals from their places in the table of different goals."""
     if "reached_counts" not in arrays:
         return None
-    goals = arrays["reached_table"][arrays["reached_index"]]
-    return Reached(arrays["reached_counts"].astype(np.int32), arrays["reached_steps"], goals)
+    try:
+        counts, steps = arrays["reached_counts"].astype(np.int32), arrays["reached_steps"]
+        goals = arrays["reached_table"][arrays["reached_index"]]
+    except (KeyError, IndexError):
+        raise DataError(f"{where}: the reached goals are incomplete") from None
+    if counts.sum() != len(steps):
+        raise DataError(f"{where}: {counts.sum()} goals were reached, in {len(steps)} steps")
+    return Reached(counts, steps, goals)

@@ -1,4 +1,4 @@
-"""Settings of data collection and pre-training, and the presets they start from. Nothing imports jax.
+"""Settings of commands that build on each other, and the presets they start from. Nothing imports jax.
 
 ``fast`` is the recipe for two cores, in ten minutes to two hours; ``paper`` has the paper's values
 (Table 6, and its code's where the text is silent); ``smoke`` only shows that everything runs. What differs
@@ -160,10 +160,9 @@ def with_settings(config: PretrainConfig, changes: Mapping[str, Any]) -> Pretrai
     groups: dict[str, dict[str, Any]] = {"": {}, "data": {}, "train": {}}
     known: dict[str, Any] = {"": config, "data": config.data, "train": config.train}
     for name, value in changes.items():
-        old = {"episodes": "trajectories"}.get(name, name)
         for group, part in known.items():
-            if old in {f.name for f in dataclasses.fields(part)}:
-                groups[group][old] = value
+            if name in {f.name for f in dataclasses.fields(part)}:
+                groups[group][name] = value
                 break
         else:
             names = [f.name for part in known.values() for f in dataclasses.fields(part)]
@@ -204,3 +203,82 @@ def saved_pretraining(saved: Mapping[str, Any], where: Path) -> dict[str, Any]:
     if "episodes" in data:
         data["trajectories"] = data.pop("episodes")
     return {**saved, "data": data}
+
+
+@dataclass(frozen=True)
+class AdaptConfig(Common):
+    """Settings of ``experiments.adapt``; values in brackets are the paper's."""
+
+    env: str = DEFAULT_WORLD
+    """The world, by name or as module:attribute (``python -m experiments.list`` shows the names)."""
+    method: Annotated[str, tyro.conf.arg(aliases=("--bandit",))] = "ucb"
+    """Who adapts, by name or as module:attribute (``python -m experiments.list`` shows the names)."""
+    policy: Path | None = None
+    """Folder of a policy (default: the released one of the world)."""
+    tasks: Path | None = None
+    """Your own tasks, an npz file with one array for each field of the world's task (default: the test
+    tasks of the world)."""
+    validation: bool = False
+    """Adapt to as many tasks that are no test tasks, to choose a method's settings by."""
+    seeds: int = number(3, at_least=1)
+    """Independent adaptations to each task [3]."""
+    episodes: int = number(100, at_least=1)
+    """Budget of episodes a task, the first evaluation of (g^M) included [100]."""
+    seed: int = 0
+    """Seed of the adaptations."""
+    eval_every: int = number(10, at_least=1)
+    """Episodes between evaluations of the best choice, which are outside of the budget."""
+    eval_episodes: int | None = number(None, at_least=1)
+    """Episodes that an evaluation averages (default: as the world's record says)."""
+    keep_actions: bool = False
+    """Also keep continuous actions in the results; discrete ones are always kept."""
+    out: Path | None = None
+    """Result folder (default: runs/adapt/ENV/METHOD-seedSEED)."""
+    figures: bool = True
+    """Draw the figures."""
+    hyper: Annotated[Any, tyro.conf.arg(name="")] = None
+    """Hyper-parameters of the method."""
+
+    @property
+    def folder(self) -> Path:
+        name = f"{file_name(self.method)}-seed{self.seed}"
+        return self.out or RUNS / "adapt" / file_name(self.env) / name
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReproduceConfig(Common):
+    """Settings of ``experiments.reproduce``."""
+
+    what: tyro.conf.Positional[str]
+    """table4 (prompt length and c of UCB), table5 (datasets), figure8 (longer prompts) or heads
+    (distributions of continuous actions)."""
+    env: str = DEFAULT_WORLD
+    """The world, by name or as module:attribute."""
+    only: tuple[str, ...] = ()
+    """Names of the datasets (table5), prompt lengths (figure8) or heads to train (default: all)."""
+    steps: int | None = number(None, at_least=1)
+    """Gradient steps of each training (default: those of the world's preset "ablation")."""
+    trajectories: Annotated[int | None, tyro.conf.arg(aliases=("--episodes",))] = number(
+        None, at_least=1
+    )
+    """Trajectories of each dataset (default: those of the world's preset "ablation")."""
+    seeds: int = number(3, at_least=1)
+    """Independent adaptations to each test task [3]."""
+    out: Path = RUNS / "reproduce"
+    """Folder of all trainings and results; tables share what they have in common."""
+
+    @property
+    def folder(self) -> Path:
+        return self.out / file_name(self.env)
+
+    @property
+    def num_steps(self) -> int:
+        return self.steps or self._preset("steps", pretrain_preset(self.env, "fast").train.steps)
+
+    @property
+    def num_trajectories(self) -> int:
+        default = pretrain_preset(self.env, "fast").data.trajectories
+        return self.trajectories or self._preset("trajectories", default)
+
+    def _preset(self, name: str, default: int) -> int:
+        return envs.find(self.env).presets.get("ablation", {}).get(name, default)

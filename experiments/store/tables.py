@@ -15,10 +15,12 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], markdown: bool = T
         return "\n".join(f"| {' | '.join(line)} |" for line in lines)
     lines = [head, *rows] if any(head) else list(rows)
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return "\n".join(
-        " ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
-        for line in lines
-    )
+    return "\n".join(aligned(line, widths) for line in lines)
+
+
+def aligned(cells: Sequence[str], widths: Sequence[int]) -> str:
+    """One line of a table, its cells as wide as their columns."""
+    return " ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)).rstrip()
 
 
 def block(title: str, rows: Sequence[tuple[str, str]]) -> str:

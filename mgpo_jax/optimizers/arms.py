@@ -28,9 +28,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from envs.base import Episode, Goals
-from mgpo_jax.optimizers.base import PromptOptimizer, SearchSpace, choose
+from mgpo_jax.optimizers.base import PromptOptimizer, SearchSpace
 from mgpo_jax.prompts import Prompt, sample_prompt, single_goal, until_reached
 from mgpo_jax.rollout import Query
+from mgpo_jax.trees import choose
 
 MAX_ARMS = 64
 SHRINKAGE = 2.0

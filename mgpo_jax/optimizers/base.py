@@ -11,9 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from envs.base import Episode
 from mgpo_jax.prompts import Prompt
@@ -62,8 +60,3 @@ class SearchSpace:
     @property
     def return_span(self) -> float:
         return self.return_range[1] - self.return_range[0]
-
-
-def choose(condition: Bool[Array, ""], if_true: Any, if_false: Any) -> Any:
-    """``if_true`` or ``if_false``, two pytrees of the same shapes."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), if_true, if_false)

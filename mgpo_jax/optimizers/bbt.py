@@ -14,9 +14,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from envs.base import Episode
-from mgpo_jax.optimizers.base import PromptOptimizer, SearchSpace, choose
+from mgpo_jax.optimizers.base import PromptOptimizer, SearchSpace
 from mgpo_jax.prompts import Prompt, sample_prompt, single_goal
 from mgpo_jax.rollout import Query
+from mgpo_jax.trees import choose
 
 
 def rank_weights(population: Any, fitness: Float[Array, "L"], state: Any, params: Any) -> Any:

@@ -9,9 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from envs.base import Episode
-from mgpo_jax.optimizers.base import PromptOptimizer, SearchSpace, choose
+from mgpo_jax.optimizers.base import PromptOptimizer, SearchSpace
 from mgpo_jax.prompts import Prompt, single_goal
 from mgpo_jax.rollout import Query
+from mgpo_jax.trees import choose
 
 ADD, DELETE, SWAP = range(3)
 
@@ -68,7 +69,7 @@ class GripsState(NamedTuple):
     episode: Int[Array, ""]
 
 
-def grips(space: SearchSpace, num_edits: int = 5) -> PromptOptimizer:
+def grips(space: SearchSpace, num_edits: int | Int[Array, ""] = 5) -> PromptOptimizer:
     """GRIPS with ``num_edits`` edited prompts an iteration, each evaluated greedily once.
 
     The first episode evaluates (g^M); Algorithm 2 leaves its return at -inf. An edit of equal return is

@@ -10,7 +10,7 @@ from mgpo_jax.optimizers.base import PromptOptimizer, SearchSpace
 
 
 def upper_confidence_bounds(
-    arms: Arms, c: float | Float[Array, ""], scale: float
+    arms: Arms, c: float | Float[Array, ""], scale: float | Float[Array, ""]
 ) -> Float[Array, "M"]:
     """UCB(p) = mean + c * scale * sqrt(log N / 2 n_p) for each arm (Eq. 3 has scale 1)."""
     pulls = jnp.maximum(arms.pulls, 1)
@@ -20,7 +20,9 @@ def upper_confidence_bounds(
 
 
 def ucb(
-    space: SearchSpace, c: float | Float[Array, ""] = 1.0, scale: float | None = None
+    space: SearchSpace,
+    c: float | Float[Array, ""] = 1.0,
+    scale: float | Float[Array, ""] | None = None,
 ) -> PromptOptimizer:
     """Algorithm 1 with UCB.
 

@@ -1,0 +1,32 @@
+"""Small functions on pytrees."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+
+def choose(condition: Bool[Array, ""], if_true: Any, if_false: Any) -> Any:
+    """``if_true`` or ``if_false``, two pytrees of the same shapes."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), if_true, if_false)
+
+
+def put_row(rows: Any, row: Any, index: Int[Array, ""]) -> Any:
+    """The stacked pytrees ``rows`` with ``row`` at ``index``."""
+    return jax.tree.map(
+        lambda old, new: jax.lax.dynamic_update_index_in_dim(old, new, index, 0), rows, row
+    )
+
+
+def named_leaves(tree: Any, lone: str) -> dict[str, Any]:
+    """The leaves of a pytree by their path, such as ``prompt.goals``.
+
+    A tree that is a leaf itself has the name ``lone``.
+    """
+    paths, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return {
+        jax.tree_util.keystr(path, simple=True, separator=".") or lone: leaf for path, leaf in paths
+    }
