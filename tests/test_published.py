@@ -1,0 +1,73 @@
+"""The published results: every kept episode can be played again, and folders of the first format are read."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import envs
+from envs.episodes import replay
+from experiments.store.results import load_results
+
+RESULTS = Path(__file__).parent.parent / "results"
+NUM_REPLAYED = 200
+REPLAYABLE = [
+    f"{world}/{method}"
+    for world in ("maze15", "gridworld")
+    for method in ("ucb", "bpe", "explore", "grips", "bbt")
+]
+
+
+@pytest.mark.parametrize("name", REPLAYABLE)
+def test_published_episodes_can_be_played_again(name):
+    results = load_results(RESULTS / name)
+    env = envs.make(results.env)
+    rng = np.random.default_rng(0)
+    where = tuple(rng.integers(size, size=NUM_REPLAYED) for size in results.returns.shape)
+    actions = results.actions[where]
+    length = (actions != 255).sum(axis=1)
+    if results.keys is None:  # a world without chance
+        keys = jax.random.split(jax.random.key(0), NUM_REPLAYED)
+    else:
+        keys = jax.random.wrap_key_data(jnp.asarray(results.keys[where]))
+    tasks = jax.tree.map(lambda leaf: jnp.asarray(leaf)[where[1]], results.task_set)
+    play = jax.jit(jax.vmap(partial(replay, env=env)))
+    played = play(key=keys, task=tasks, actions=actions.astype(np.int32), length=length)
+    np.testing.assert_allclose(played.return_, results.returns[where], atol=1e-5)
+    np.testing.assert_array_equal(played.trajectory.length, length)
+    reached = np.asarray(played.trajectory.goal_reached).sum(axis=1)
+    np.testing.assert_array_equal(reached, results.reached.counts[where])
+
+
+@pytest.mark.parametrize("name", ["maze15/ucb", "gridworld/ucb"])
+def test_reached_goals_are_those_of_the_replayed_episodes(name):
+    results = load_results(RESULTS / name)
+    env = envs.make(results.env)
+    reached = results.reached
+    ends = np.cumsum(reached.counts.ravel()).reshape(reached.counts.shape)
+    assert ends[-1, -1, -1] == len(reached.steps) == len(reached.goals)
+    for where in [(0, 0, 0), (1, 7, 13), (2, 49, 99)]:
+        actions = jnp.asarray(results.actions[where], jnp.int32)
+        key = jax.random.key(0)
+        if results.keys is not None:
+            key = jax.random.wrap_key_data(jnp.asarray(results.keys[where]))
+        length = jnp.sum(actions != 255)
+        task = jax.tree.map(jnp.asarray, results.task(where[1]))
+        episode = replay(key, env, task, actions, length)
+        steps = np.flatnonzero(episode.trajectory.goal_reached)
+        rows = slice(ends[where] - reached.counts[where], ends[where])
+        np.testing.assert_array_equal(reached.steps[rows], steps)
+        np.testing.assert_array_equal(reached.goals[rows], episode.trajectory.achieved_goals[steps])
+
+
+def test_results_of_the_first_format_are_read():
+    results = load_results(RESULTS / "kitchen" / "ucb")
+    assert results.method == "ucb"
+    assert results.actions is None and results.reached is None
+    assert results.best_goals(0, 0).shape[1] == results.task_goals.shape[1] == 5
+    assert set(results.choices) == {"prompt.goals", "prompt.mask", "greedy"}
