@@ -205,7 +205,7 @@ def _bench_decode(
     _, first = jax.vmap(env.reset)(keys, tasks)
     _, carry = jax.jit(jax.vmap(functions.prefill))(prompts, first.obs)
     action = jax.tree.map(lambda leaf: jnp.stack([leaf] * lanes), env.spec.zero_action())
-    for position in (horizon // 8, horizon // 2, horizon):
+    for position in sorted({max(2, horizon // part) for part in (8, 2, 1)}):
         room = jax.vmap(lambda cache, n=position - 1: functions.grow(cache, n))(carry)
         num_steps = min(16, position - 1)
 

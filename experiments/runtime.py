@@ -56,10 +56,15 @@ def configure() -> None:
         libc.mallopt(M_TRIM_THRESHOLD, (1 << 31) - 1)
         libc.mallopt(M_TOP_PAD, 1 << 28)
 
+    cache = os.environ.get("MGPO_CACHE", str(Path.home() / ".cache" / "mgpo_jax"))
     # jax reads these when it is imported, which is after a command has found nothing wrong.
-    default = Path.home() / ".cache" / "mgpo_jax"
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = os.environ.get("MGPO_CACHE", str(default))
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = cache
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.5"
+    if "jax" in sys.modules:  # a world or method of a user was imported with it
+        import jax
+
+        jax.config.update("jax_compilation_cache_dir", cache)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
 def run(
@@ -83,7 +88,8 @@ def run(
     try:
         values = {} if default is None else {"default": default(words)}
         parsed: Any = tyro.conf.OmitArgPrefixes[config_class]
-        config = tyro.cli(parsed, args=words, description=main.__doc__, **values)
+        name = f"python -m {main.__globals__['__spec__'].name}"
+        config = tyro.cli(parsed, prog=name, args=words, description=main.__doc__, **values)
         check_settings(config)
         configure()
         main(config)

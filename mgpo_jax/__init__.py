@@ -37,10 +37,10 @@ if TYPE_CHECKING:
     from mgpo_jax.optimizers.methods import prompt_adapter
     from mgpo_jax.policy import LoadedPolicy, Policy
     from mgpo_jax.policy_files import load_policy, save_policy
-    from mgpo_jax.prompts import Prompt, prompt_of, sample_prompt
-    from mgpo_jax.rollout import Query
+    from mgpo_jax.prompts import Prompt, prompt_of, sample_prompt, single_goal
+    from mgpo_jax.rollout import Query, prompted
     from mgpo_jax.runner import Outcome, adapt, evaluate, play, sweep
-    from mgpo_jax.settings import TrainConfig
+    from mgpo_jax.settings import TrainConfig, number
     from mgpo_jax.tasks import load_tasks, sample_tasks, save_tasks, test_tasks
     from mgpo_jax.training import pretrain
 
@@ -59,10 +59,10 @@ _PLACES = {
     "mgpo_jax.optimizers.methods": ("prompt_adapter",),
     "mgpo_jax.policy": ("LoadedPolicy", "Policy"),
     "mgpo_jax.policy_files": ("load_policy", "save_policy"),
-    "mgpo_jax.prompts": ("Prompt", "prompt_of", "sample_prompt"),
-    "mgpo_jax.rollout": ("Query",),
+    "mgpo_jax.prompts": ("Prompt", "prompt_of", "sample_prompt", "single_goal"),
+    "mgpo_jax.rollout": ("Query", "prompted"),
     "mgpo_jax.runner": ("Outcome", "adapt", "evaluate", "play", "sweep"),
-    "mgpo_jax.settings": ("TrainConfig",),
+    "mgpo_jax.settings": ("TrainConfig", "number"),
     "mgpo_jax.tasks": ("load_tasks", "sample_tasks", "save_tasks", "test_tasks"),
     "mgpo_jax.training": ("pretrain",),
 }  # fmt: skip

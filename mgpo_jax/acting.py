@@ -101,6 +101,11 @@ class Actor:
                 f"the policy takes observations of shape {list(self.config.obs_shape)}, found "
                 f"{list(array.shape)}"
             )
-        if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
+        fractions = np.issubdtype(array.dtype, np.inexact)
+        if fractions and not np.issubdtype(self.config.obs_dtype, np.inexact):
+            raise UsageError(
+                f"the policy takes observations of {self.config.obs_dtype}, found {array.dtype}"
+            )
+        if fractions and not np.isfinite(array).all():
             raise UsageError("the observation holds NaN or infinity")
         return jnp.asarray(array, self.config.obs_dtype)

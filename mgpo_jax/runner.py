@@ -153,25 +153,21 @@ def sweep(
       UsageError: if a number is below 1, or the method cannot be used in this setting.
       DataError: if the policy was made for another world.
     """
-    for name, value in {"seeds": seeds, "episodes": episodes, "eval_every": eval_every}.items():
-        if value < 1:
-            raise UsageError(f"{name} must be at least 1, found {value}")
-    network, params = policy.config, policy.params
-    check_fits(network, env.spec)
-    setting = Setting(env, network, episodes, judged or Judgement())
+    _check_positive(seeds=seeds, episodes=episodes, eval_every=eval_every)
+    check_fits(policy.config, env.spec)
+    setting = Setting(env, policy.config, episodes, judged or Judgement())
     for hyper in hypers:
         method.check_use(setting, hyper)
     fixed, numbers = split_hyper(hypers)
-    adapter = method.adapter(setting, params, hypers[0])
+    adapter = method.adapter(setting, policy.params, hypers[0])
     segments = _segments(adapter, episodes, eval_every)
     grid = Grid(variants=len(hypers), seeds=seeds, tasks=num_tasks(tasks))
     layout = _lay_out(env, grid.size, _memory_bytes(env, adapter, tasks))
     program = _program(method, setting, fixed, layout, max(segments), keep_actions)
     lanes = split(layout.mesh, grid.lanes(layout, tasks, seed, numbers))
-    shared = replicate(layout.mesh, params)
-    record, cpu = _run(program, lanes, shared, segments, grid)
-    judging = (len(segments) + 1) * setting.judged.episodes
-    per_lane = episodes + judging
+    params = replicate(layout.mesh, policy.params)
+    record, cpu = _run(program, lanes, params, segments, grid)
+    per_lane = episodes + (len(segments) + 1) * setting.judged.episodes
     # The search, too, begins with one evaluation of the initial choice.
     after = np.concatenate([[1], np.cumsum(segments) * adapter.episodes_per_round])
     return [
@@ -184,6 +180,13 @@ def sweep(
         )
         for variant in range(len(hypers))
     ]
+
+
+def _check_positive(**numbers: int) -> None:
+    """Raise ``UsageError`` for the first number that is below 1."""
+    for name, value in numbers.items():
+        if value < 1:
+            raise UsageError(f"{name} must be at least 1, found {value}")
 
 
 def _segments(adapter: Adapter, episodes: int, eval_every: int) -> list[int]:

@@ -10,9 +10,9 @@ import pytest
 from evosax.algorithms import CMA_ES
 from scipy import stats
 
+from envs.base import Episode, Trajectory
 from mgpo_jax.optimizers import SearchSpace, bbt
 from mgpo_jax.optimizers.bbt import rank_weights
-from mgpo_jax.types import Episode, Trajectory
 
 DIM, POPULATION, NUM_RUNS, NUM_PYCMA = 5, 10, 60, 20
 SCALES = {"sphere": np.ones(DIM), "ellipsoid": 10 ** np.linspace(0, 3, DIM)}
@@ -24,7 +24,7 @@ TASK_GOAL = jnp.array([0.9, 0.8])
 BLANK = Trajectory(
     obs=jnp.zeros((NUM_STEPS, 1)),
     actions=jnp.zeros(NUM_STEPS, jnp.int32),
-    goals=jnp.zeros((NUM_STEPS, 2)),
+    achieved_goals=jnp.zeros((NUM_STEPS, 2)),
     goal_reached=jnp.zeros(NUM_STEPS, bool),
     outcomes=jnp.zeros((NUM_STEPS, 2)),
     length=jnp.int32(0),
@@ -114,17 +114,23 @@ def play(key, query):
     length = jax.random.randint(key_length, (), 2, NUM_STEPS + 1)
     real = jnp.arange(NUM_STEPS) < length
     trajectory = BLANK._replace(
-        goals=jnp.where(real[:, None], jax.random.uniform(key_goals, (NUM_STEPS, 2)), 0.0),
+        achieved_goals=jnp.where(real[:, None], jax.random.uniform(key_goals, (NUM_STEPS, 2)), 0.0),
         goal_reached=real,
         outcomes=jnp.where(real[:, None], 2.0, 0.0),
         length=length,
     )
     return_ = jnp.round(-10 * jnp.sum(query.prompt.goals**2)) / 10
-    return Episode(trajectory, jnp.zeros(NUM_STEPS), return_)
+    return Episode(trajectory, jnp.zeros(NUM_STEPS), return_, last_obs=jnp.zeros(1))
 
 
 def search(key):
-    space = SearchSpace(NUM_SLOTS, lambda key: jnp.zeros(2), (-10.0, 0.0), NUM_EPISODES)
+    space = SearchSpace(
+        num_slots=NUM_SLOTS,
+        horizon=NUM_STEPS,
+        return_range=(-10.0, 0.0),
+        num_episodes=NUM_EPISODES,
+        sample_goal=lambda key: jnp.zeros(2),
+    )
     optimizer = bbt(space, POPULATION, 4, std_init=STD_INIT)
     key_init, key_run = jax.random.split(key)
 
@@ -137,7 +143,7 @@ def search(key):
         states = (state._replace(start_key=jnp.int32(0)) for state in (asked, told))
         return told, (query, result, *states, optimizer.best(told))
 
-    state = optimizer.init(key_init, TASK_GOAL, BLANK)
+    state = optimizer.init(key_init, TASK_GOAL)
     return jax.lax.scan(episode, state, jax.random.split(key_run, NUM_EPISODES))[1]
 
 
@@ -170,7 +176,7 @@ def test_prompts_are_p0_plus_a_z_in_order(logs):
         np.testing.assert_allclose(queries.prompt.goals[0], [[0, 0], [0, 0], TASK_GOAL])
         start = lane(asked.start, 1)
         sizes.add(int(start.mask.sum()))
-        steps = results.trajectory.goals[0][: results.trajectory.length[0]].tolist()
+        steps = results.trajectory.achieved_goals[0][: results.trajectory.length[0]].tolist()
         at = [steps.index(goal) for goal in start.goals[start.mask][:-1].tolist()]
         assert at == sorted(set(at))
         np.testing.assert_array_equal(start.goals[-1], TASK_GOAL)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from experiments.bench import BenchConfig, main, sequence_flops
+from experiments.bench import BenchConfig, main
+from experiments.measurements import sequence_flops
 from mgpo_jax.transformer import TransformerConfig
 
-CONFIG = TransformerConfig(obs_dim=3, goal_dim=2, action_dim=4, horizon=9, embed_dim=8)
+CONFIG = TransformerConfig(obs_shape=(3, 2), goal_dim=2, action_dim=4, horizon=9, embed_dim=8)
 
 
 def products(num_goals: int, num_steps: int) -> int:
@@ -27,7 +29,7 @@ def products(num_goals: int, num_steps: int) -> int:
                 total += 2 * square  # query and mix
                 total += 2 * (4 * square)  # feed-forward
                 total += 2 * (2 * width * (position + 1))  # scores and weighted values
-    embed = 2 * width * (CONFIG.obs_dim + CONFIG.action_dim)
+    embed = 2 * width * (math.prod(CONFIG.obs_shape) + CONFIG.action_dim)
     return total + num_steps * (embed + 2 * width * CONFIG.action_dim)
 
 
@@ -40,7 +42,7 @@ def test_flops_are_those_of_the_products(num_goals: int, num_steps: int) -> None
 @pytest.mark.slow
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "bench.json"
-    main(BenchConfig(demonstrator="astar2", quick=True, episodes=200, json=path))
+    main(BenchConfig(demonstrator="astar2", quick=True, trajectories=200, json=path))
     rows = json.loads(path.read_text())["rows"]
     found = {row["name"].strip(): row for row in rows}
     assert found["collection"]["note"].startswith("astar2")

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from envs.bitboard import distances, pack, single, spread, toward, unpack
+from envs.maze.bitboard import distances, pack, single, spread, toward, unpack
 
 SIDES = (5, 8, 15, 32)  # few, because each shape compiles anew
 

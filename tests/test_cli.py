@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import os
 import shutil
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,13 +20,15 @@ import pytest
 import tyro
 
 import envs
-from experiments import adapt, collect, evaluate, plot, pretrain, release, runtime
-from experiments.adapt import AdaptConfig
-from experiments.collect import CollectConfig
-from experiments.configs import PretrainConfig, pretrain_default, pretrain_preset
-from experiments.evaluate import EvaluateConfig
-from experiments.release import ReleaseConfig
-from experiments.tasks import (
+from envs.registry import WORLDS
+from experiments import pretrain, runtime, training
+from experiments.__main__ import COMMANDS
+from experiments.store.settings import PretrainConfig, pretrain_default, pretrain_preset
+from mgpo_jax import methods
+from mgpo_jax.dataset import load_dataset
+from mgpo_jax.files import hash_file
+from mgpo_jax.policy_files import read_policy
+from mgpo_jax.tasks import (
     benchmark_tasks,
     load_tasks,
     num_tasks,
@@ -31,10 +36,8 @@ from experiments.tasks import (
     save_tasks,
     task_hashes,
 )
-from mgpo_jax.checkpoint import load_policy_files
-from mgpo_jax.dataset import load_dataset
-from mgpo_jax.files import hash_file
 
+ROOT = Path(__file__).parents[1]
 Run = Callable[..., tuple[int, str]]
 
 
@@ -46,22 +49,13 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+def command(capsys: pytest.CaptureFixture[str]) -> Run:
     """Runs a command in this process; returns its exit code and what it wrote to stderr."""
-    mains: dict[str, tuple[Any, ...]] = {
-        "collect": (CollectConfig, collect.main),
-        "pretrain": (tyro.conf.OmitArgPrefixes[PretrainConfig], pretrain.main, pretrain_default),
-        "adapt": (tyro.conf.OmitArgPrefixes[AdaptConfig], adapt.main),
-        "evaluate": (EvaluateConfig, evaluate.main),
-        "release": (ReleaseConfig, release.main),
-        "plot": (plot.PlotConfig, plot.main),
-    }
 
     def call(line: str) -> tuple[int, str]:
         name, *words = line.split()
-        monkeypatch.setattr(sys, "argv", [name, *words])
         with pytest.raises(SystemExit) as stop:
-            runtime.run(*mains[name])
+            importlib.import_module(f"experiments.{name}").command(words)
         return int(stop.value.code or 0), capsys.readouterr().err
 
     return call
@@ -109,26 +103,39 @@ RESULT = Path(__file__).parents[1] / "results/maze15/ucb"
         ("adapt --bandit ubc", 2, "did you mean 'ucb'"),
         ("adapt --episodes 0", 2, "--episodes must be at least 1"),
         ("adapt --seeds 0", 2, "--seeds must be at least 1"),
-        ("adapt --bandit bpe --c 2", 2, "--c is no option of bpe"),
-        ("adapt --bandit bbt --std-init 0", 2, "--std-init must be finite and above 0"),
-        ("adapt --bandit ucb --scale nan", 2, "--scale must be finite and above 0"),
+        ("adapt --bandit bpe --c 2", 2, "--c is no setting of bpe; it is one of ucb"),
+        ("adapt --bandit bbt --std-init 0", 2, "--std-init must be above 0"),
+        ("adapt --bandit ucb --scale nan", 2, "--scale must be a finite number"),
         ("adapt --validation --tasks mine.npz", 2, "--validation draws the tasks"),
         ("adapt --policy nowhere", 2, "no policy in nowhere"),
-        ("pretrain --env gridwrld", 2, "unknown environment 'gridwrld'"),
+        ("adapt --bandit gcbc --max-goals 3", 2, "no setting of gcbc; it is one of ucb, bpe"),
+        ("adapt --method grips --no-keep-rewarded", 2, "--keep-rewarded is no setting of grips"),
+        (
+            "adapt --method=bbt --num_edits=4",
+            2,
+            "--num-edits is no setting of bbt; it is one of gr",
+        ),
+        ("adapt --method bbt --population-size 1", 2, "--population-size must be at least 2"),
+        ("adapt --method nowhere:METHOD", 2, "cannot load the method 'nowhere:METHOD'"),
+        ("adapt --eval-episodes 0", 2, "--eval-episodes must be at least 1"),
+        ("collect --demonstrator astr4", 2, "did you mean 'astar4'"),
+        ("collect --trajectories 0", 2, "--trajectories must be at least 1"),
+        ("collect --env envs.maze:MAZE51", 2, "cannot load the world 'envs.maze:MAZE51'"),
+        ("pretrain --env gridwrld", 2, "unknown world 'gridwrld'; did you mean 'gridworld'?"),
         ("pretrain --preset papr", 2, "did you mean 'paper'"),
         ("pretrain --steps 0", 2, "--steps must be at least 1"),
-        ("pretrain --resume --out nothing --preset smoke --episodes 0", 2, "--episodes must be"),
+        ("pretrain --resume --out nothing --preset smoke --episodes 0", 2, "--trajectories must"),
         ("pretrain --policy astar3 --preset smoke", 2, "did you mean 'astar"),
         ("pretrain --batch-size 10 --part-size 4", 2, "not a multiple"),
         ("collect --policy astr4", 2, "did you mean 'astar4'"),
-        ("collect --episodes 0", 2, "--episodes must be at least 1"),
+        ("collect --episodes 0", 2, "--trajectories must be at least 1"),
         ("evaluate", 2, "no result folder given"),
         (f"evaluate {RESULT} --obs-noise -1", 2, "noise must be finite and not negative"),
         (f"evaluate {RESULT} --obs-noise nan", 2, "noise must be finite and not negative"),
         (f"evaluate {RESULT} --action-noise 0.1 -1", 2, "noise must be finite and not negative"),
         ("evaluate nowhere", 1, "no result folder nowhere"),
-        ("pretrain --obs-noise -1", 2, "--obs-noise must be finite and not negative"),
-        ("pretrain --obs-noise nan", 2, "--obs-noise must be finite and not negative"),
+        ("pretrain --obs-noise -1", 2, "--obs-noise must be at least 0"),
+        ("pretrain --obs-noise nan", 2, "--obs-noise must be a finite number"),
     ],
 )
 def test_usage_errors_name_the_mend(command: Run, line: str, code: int, says: str) -> None:
@@ -150,12 +157,113 @@ def test_debug_shows_the_traceback(command: Run) -> None:
 
 
 def test_unexpected_errors_are_one_line(command: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collect, "make_env", lambda name: 1 / 0)
+    monkeypatch.setattr(envs, "make", lambda name: 1 / 0)
     code, text = command("collect")
     assert code == 1
     assert text.startswith("error: ZeroDivisionError")
     assert "--debug" in text
     assert "Traceback" not in text
+
+
+@pytest.fixture
+def parsed(monkeypatch: pytest.MonkeyPatch, command: Run) -> Callable[[str], Any]:
+    """What a command line is parsed into."""
+
+    def parse(line: str) -> Any:
+        found: list[Any] = []
+        module = importlib.import_module(f"experiments.{line.split()[0]}")
+        monkeypatch.setattr(module, "main", found.append)
+        code, text = command(line)
+        assert code == 0, text
+        return found[0]
+
+    return parse
+
+
+def test_bandit_is_another_name_of_method(parsed: Callable[[str], Any]) -> None:
+    wanted = parsed("adapt --method bpe --min-std 0.1")
+    assert (wanted.method, wanted.hyper) == ("bpe", methods.BpeHyper(min_std=0.1))
+    assert wanted.folder == Path("runs/adapt/maze15/bpe-seed0")
+    for line in (
+        "--bandit bpe --min-std 0.1",
+        "--min-std=0.1 --bandit=bpe",
+        "--min_std 0.1 --bandit bpe",
+    ):
+        assert parsed(f"adapt {line}") == wanted
+    assert parsed("adapt").hyper == methods.UcbHyper()
+    assert parsed("adapt --method grips --num-edits 3").hyper == methods.GripsHyper(num_edits=3)
+
+
+@pytest.mark.parametrize(
+    "line", ["collect", "pretrain --preset smoke", "bench", "reproduce table5"]
+)
+def test_older_names_of_flags_stay(parsed: Callable[[str], Any], line: str) -> None:
+    new, old = "--trajectories 77", "--episodes 77"
+    if not line.startswith("reproduce"):
+        new, old = f"{new} --demonstrator astar2", f"{old} --policy astar2"
+    found = parsed(f"{line} {new}")
+    assert parsed(f"{line} {old}") == found
+    data = getattr(found, "data", found)
+    assert data.trajectories == 77
+    assert getattr(data, "demonstrator", "astar2") == "astar2"
+
+
+def run_python(words: str, here: Path) -> subprocess.CompletedProcess[str]:
+    """A process of its own whose current folder is ``here``."""
+    path = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, *words.split()]
+    return subprocess.run(command, check=False, cwd=here, env=path, capture_output=True, text=True)
+
+
+def test_the_console_script_lists_its_commands(tmp_path: Path) -> None:
+    for words in ("-m experiments", "-m experiments --help"):
+        done = run_python(words, tmp_path)
+        assert (done.returncode, done.stderr) == (0, "")
+        listed = [line.split()[0] for line in done.stdout.splitlines()[2:]]
+        assert listed == list(COMMANDS)
+    modules = {path.stem for path in (ROOT / "experiments").glob("*.py")}
+    assert modules >= set(COMMANDS)
+
+
+def test_the_console_script_runs_its_commands(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    entry = importlib.import_module("experiments.__main__").main
+    for words, code, says in (
+        (["adpt"], 2, "error: unknown command 'adpt'; did you mean 'adapt'?"),
+        (["adapt", "--env", "maze51"], 2, "did you mean 'maze15'?"),
+        (["evaluate"], 2, "no result folder given"),
+        (["list"], 0, ""),
+    ):
+        monkeypatch.setattr(sys, "argv", ["mgpo", *words])
+        with pytest.raises(SystemExit) as stop:
+            entry()
+        text = capsys.readouterr().err
+        assert (stop.value.code, says in text) == (code, True), text
+        assert len(text.strip().splitlines()) == (code > 0)
+
+
+def test_list_names_worlds_and_methods(tmp_path: Path) -> None:
+    done = run_python("-m experiments.list", tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    first = {line.split()[0]: line for line in done.stdout.splitlines() if line.startswith("  ")}
+    assert set(first) == {*envs.names(), *methods.names()}
+    assert envs.find("maze15").summary in first["maze15"]
+    assert methods.find("bbt").summary in first["bbt"]
+    assert all(len(line.split()) > 3 for line in first.values())
+
+
+def test_folders_in_the_current_folder_hide_nothing_of_ours(tmp_path: Path) -> None:
+    for name in ("envs", "mgpo_jax"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text("raise RuntimeError('not ours')\n")
+    done = run_python("-m experiments.list", tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "maze15" in done.stdout
+    done = run_python("-m experiments list", tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    done = run_python("-m experiments.collect --env envs.maze:MAZE51", tmp_path)
+    assert (done.returncode, "no attribute 'MAZE51'" in done.stderr) == (2, True), done.stderr
 
 
 def test_existing_folders_are_never_overwritten(command: Run, workspace: Path) -> None:
@@ -188,13 +296,13 @@ def test_dataset_is_made_by_its_seed_and_holds_no_test_task(command: Run, worksp
     assert facts["length"] == again["length"]
     assert facts["num_trajectories"] == 40
     assert first.lengths.min() >= 20
-    hashes = task_hashes(env, benchmark_tasks(env))
+    hashes = task_hashes(env, benchmark_tasks(env, 50))
     assert len(set(hashes)) == 50
     assert not np.isin(first.task_hashes, hashes).any()
 
 
 def weights(folder: Path) -> Any:
-    return load_policy_files(folder / "policy")[1]
+    return read_policy(folder / "policy").params
 
 
 def test_resumed_run_equals_an_uninterrupted_one(
@@ -209,7 +317,7 @@ def test_resumed_run_equals_an_uninterrupted_one(
 
     line = f"{TINY} --out second"
     with monkeypatch.context() as patch:
-        patch.setattr(pretrain, "stop_request", ctrl_c_after_four_steps)
+        patch.setattr(training, "stop_request", ctrl_c_after_four_steps)
         code, text = command(line)
     assert code == 130
     assert "stopped at step 4; continue with --resume" in text
@@ -253,8 +361,8 @@ def test_adapt_writes_what_it_prints(
     assert code == 0, text
     summary = json.loads(Path("result/summary.json").read_text())
     raw = np.load("result/results.npz")
-    assert raw["returns"].shape == raw["greedy"].shape == (2, 3, 5)
-    assert raw["prompt_goals"].shape == raw["best_goals"].shape == (2, 3, 5, 5, 2)
+    assert raw["returns"].shape == raw["choice.greedy"].shape == (2, 3, 5)
+    assert raw["choice.prompt.goals"].shape == raw["best.prompt.goals"].shape == (2, 3, 5, 5, 2)
     np.testing.assert_array_equal(raw["eval_episodes"], [1, 2, 4, 5])
     assert summary["num_tasks"] == 3
     assert summary["num_seeds"] == 2
@@ -266,7 +374,7 @@ def test_adapt_writes_what_it_prints(
         (raw["optimal_returns"] - raw["eval_returns"][:, :, -1]).mean()
     )
     # Mazes are deterministic: what the search saw is what the evaluation sees.
-    greedy = np.where(raw["greedy"], raw["returns"], -np.inf)
+    greedy = np.where(raw["choice.greedy"], raw["returns"], -np.inf)
     np.testing.assert_allclose(
         np.maximum.accumulate(greedy, axis=-1)[:, :, [0, 1, 3, 4]], raw["eval_returns"], atol=1e-5
     )
@@ -274,7 +382,7 @@ def test_adapt_writes_what_it_prints(
     code, text = command(f"{line.replace('result', 'others')} --validation")
     assert code == 0, text
     env = envs.make("maze15")
-    others, tests = load_tasks(Path("others/tasks.npz"), env), benchmark_tasks(env)
+    others, tests = load_tasks(Path("others/tasks.npz"), env), benchmark_tasks(env, 50)
     assert num_tasks(others) == num_tasks(tests)
     assert not np.isin(task_hashes(env, others), task_hashes(env, tests)).any()
 
@@ -318,7 +426,7 @@ def test_results_know_the_weights_they_were_made_with(command: Run, workspace: P
     for line in ("evaluate result --episodes 1", "plot result"):
         code, text = command(line)
         assert code == 1
-        assert "not those that the prompts of maze15 ucb were found with" in text
+        assert "not those that the results of maze15 ucb were found with" in text
 
 
 def test_prompts_longer_than_trained(command: Run, workspace: Path) -> None:
@@ -350,7 +458,7 @@ def walled_in(tasks: Any) -> np.ndarray:
         (lambda t: {"goal": t.goal + 0.5}, "integers"),
         (lambda t: {"goal": t.goal[:1]}, "shape [2, 2]"),
         (lambda t: {"maze": walled_in(t)}, "no free path leads from the start"),
-        (lambda t: {"maze": t.maze * np.nan}, "0 (free) and 1 (wall) only"),
+        (lambda t: {"maze": t.maze * np.nan}, "maze must hold integers, found float64"),
     ],
 )
 def test_bad_task_files(
@@ -390,17 +498,17 @@ def test_tasks_survive_the_file(tmp_path: Path) -> None:
 def test_presets_differ_as_they_say() -> None:
     paper = pretrain_preset("maze15", "paper")
     assert (paper.train.steps, paper.train.learning_rate, paper.dropout) == (50_000, 1e-4, 0.1)
-    assert (paper.data.episodes, paper.prompt_order) == (10_000, False)
+    assert (paper.data.trajectories, paper.prompt_order) == (10_000, False)
     assert replace(pretrain_default([]), preset="fast") == pretrain_preset("maze15", "fast")
 
 
 def test_release_packs_a_run_with_its_card(command: Run, workspace: Path) -> None:
     assert command(f"release {RUN} --out packed") == (0, "released in packed\n")
-    config, _, made = load_policy_files(Path("packed"))
-    assert (config.embed_dim, made["steps"]) == (8, 6)
+    packed = read_policy(Path("packed"))
+    assert (packed.config.embed_dim, packed.made["steps"]) == (8, 6)
     env = envs.make("maze15")
     tasks = load_tasks(Path("packed/tasks.npz"), env)
-    assert (task_hashes(env, tasks) == task_hashes(env, benchmark_tasks(env))).all()
+    assert (task_hashes(env, tasks) == task_hashes(env, benchmark_tasks(env, 50))).all()
     card = Path("packed/README.md").read_text()
     assert "40 demonstrations of astar4, seed 0" in card
     assert "6 steps of 8 trajectories, muon" in card
@@ -416,17 +524,21 @@ def test_a_continuous_world_from_data_to_release(
 ) -> None:
     """Heads, standardized observations and noise, on single subtasks of a short kitchen."""
     pytest.importorskip("mujoco")
-    from envs.experts import kitchen as experts
-    from envs.kitchen import Kitchen
+    from envs.kitchen import demonstrators
+    from envs.kitchen.env import Kitchen
 
-    real = experts.kitchen_demonstrators
+    kitchen = envs.find("kitchen")
 
     def of_single_subtasks(env: Any) -> Any:
         sample = lambda key, index: env.task(index % 5)  # noqa: E731
-        return {"expert": real(env)["expert"]._replace(sample_task=sample)}
+        return {"expert": kitchen.demonstrators(env)["expert"]._replace(sample_task=sample)}
 
-    monkeypatch.setattr(experts, "kitchen_demonstrators", of_single_subtasks)
-    monkeypatch.setitem(envs.ENVIRONMENTS, "kitchen", lambda: Kitchen("kitchen", horizon=120))
+    short = replace(
+        kitchen,
+        make=lambda: Kitchen("kitchen", horizon=120),
+        demonstrators=of_single_subtasks,
+    )
+    monkeypatch.setattr(WORLDS, "find", {"kitchen": short}.__getitem__)
     line = (
         "pretrain --env kitchen --preset smoke --episodes 24 --holdout 8 --embed-dim 8 "
         "--num-layers 1 --steps 4 --batch-size 8 --part-size 4 --bucket 60 --eval-tasks 2 "
@@ -434,9 +546,9 @@ def test_a_continuous_world_from_data_to_release(
     )
     code, text = command(f"{line} --out run")
     assert code == 0, text
-    network, _, _ = load_policy_files(Path("run/policy"))
+    network = read_policy(Path("run/policy")).config
     dataset, manifest = load_dataset(Path("data/kitchen/expert-24-seed0"))
-    assert manifest["settings"] == {"noise": experts.NOISE}
+    assert manifest["settings"] == {"noise": demonstrators.NOISE}
     assert network.head == "binned"
     np.testing.assert_allclose(network.obs_mean, dataset.obs.mean(axis=0), atol=1e-3)
     assert manifest["failed_episodes"] == 0

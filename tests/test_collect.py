@@ -8,28 +8,28 @@ import numpy as np
 import pytest
 
 import envs
-from envs.experts import demonstrators
-from envs.wrapper import Wrapper
-from experiments.collect import collect
-from experiments.tasks import benchmark_tasks, task_hashes
-from mgpo_jax.errors import DataError
+from envs.errors import DataError
+from envs.wrappers import Wrapper
+from experiments.datasets import collect
+from mgpo_jax.tasks import benchmark_tasks, task_hashes
 
 WORLD = envs.make("gridworld")
+EXPERT = envs.find("gridworld").demonstrators(WORLD)["expert"]
 FIRST = 5000  # of the tasks below
 
 
 def test_tasks_in_turn_are_demonstrated_equally_often() -> None:
     """Dropped are episodes of every eighth length, which is a matter of luck, since starts are random."""
-    demonstrator = demonstrators(WORLD)["expert"]._replace(
+    demonstrator = EXPERT._replace(
         sample_task=lambda key, index: WORLD.task(FIRST + index % 16),
         keeps=lambda episode: episode.trajectory.length % 8 > 0,
     )
-    dataset, facts = collect(WORLD, demonstrator, 2000, seed=0)
+    dataset, facts = collect(WORLD, demonstrator, 2000, seed=0, num_test_tasks=50)
     assert len(dataset) == 2000
     assert (dataset.lengths % 8 > 0).all()
     assert facts["tried_again"] > 100
     _, counts = np.unique(dataset.task_hashes, return_counts=True)
-    tests = np.isin(task_hashes(WORLD, benchmark_tasks(WORLD)), dataset.task_hashes)
+    tests = np.isin(task_hashes(WORLD, benchmark_tasks(WORLD, 50)), dataset.task_hashes)
     assert not tests.any()
     assert counts.max() - counts.min() <= 6, counts
 
@@ -46,19 +46,17 @@ class Breaking(Wrapper):
 
 def test_episodes_of_broken_worlds_are_counted_not_kept() -> None:
     """Of tasks of three objects, most of which take fewer steps."""
-    demonstrator = demonstrators(WORLD)["expert"]._replace(
-        sample_task=lambda key, index: WORLD.task(index % 200)
-    )
-    dataset, facts = collect(Breaking(WORLD), demonstrator, 500, seed=0)
+    demonstrator = EXPERT._replace(sample_task=lambda key, index: WORLD.task(index % 200))
+    dataset, facts = collect(Breaking(WORLD), demonstrator, 500, seed=0, num_test_tasks=50)
     assert len(dataset) == 500
     assert dataset.lengths.max() < 30
     assert facts["failed_episodes"] == facts["tried_again"] > 10
 
 
 def test_a_task_that_cannot_be_demonstrated_is_an_error() -> None:
-    demonstrator = demonstrators(WORLD)["expert"]._replace(
+    demonstrator = EXPERT._replace(
         sample_task=lambda key, index: WORLD.task(index),
         keeps=lambda episode: episode.trajectory.length < 5,
     )
     with pytest.raises(DataError, match=r"failed 20 times at task [0-9]+ of gridworld"):
-        collect(WORLD, demonstrator, 500, seed=0)
+        collect(WORLD, demonstrator, 500, seed=0, num_test_tasks=50)

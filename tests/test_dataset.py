@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from envs.base import EnvSpec
+from envs.base import ArraySpec, Box, Discrete, EnvSpec, Trajectory
+from envs.errors import DataError
 from mgpo_jax.dataset import (
     ARRAYS,
     MANIFEST,
@@ -23,21 +24,16 @@ from mgpo_jax.dataset import (
     plan_batches,
     save_dataset,
 )
-from mgpo_jax.errors import DataError
 from mgpo_jax.files import hash_file
-from mgpo_jax.types import Trajectory
 
 SPEC = EnvSpec(
     name="toy",
-    obs_dim=2,
+    obs=ArraySpec((2,)),
     goal_dim=3,
-    action_dim=4,
-    discrete=True,
+    actions=Discrete(4),
     horizon=9,
     return_range=(0.0, 1.0),
     truncate_in_hindsight=True,
-    deterministic=True,
-    reward_confirms_goals=False,
 )
 LENGTHS = [3, 1, 9, 4]
 
@@ -52,11 +48,13 @@ def make_dataset(lengths=LENGTHS):
     return Dataset(
         obs=np.stack([index, step], axis=1).astype(np.float32),
         actions=rng.integers(SPEC.action_dim, size=total).astype(np.int32),
-        goals=rng.normal(size=(total, SPEC.goal_dim)).astype(np.float32),
+        achieved_goals=rng.normal(size=(total, SPEC.goal_dim)).astype(np.float32),
         goal_reached=rng.random(total) < 0.5,
         outcomes=rng.normal(size=(total, SPEC.goal_dim)).astype(np.float32),
         lengths=lengths,
         task_hashes=np.arange(len(lengths), dtype=np.uint64) + 100,
+        rewards=rng.random(total).astype(np.float32),
+        last_obs=np.stack([np.arange(len(lengths)), lengths + 1], axis=1).astype(np.float32),
     )
 
 
@@ -72,15 +70,18 @@ def folder(tmp_path, dataset):
 
 
 def assert_equal(a, b):
-    for name, array in vars(a).items():
-        np.testing.assert_array_equal(array, vars(b)[name])
-        assert array.dtype == vars(b)[name].dtype
+    assert a.arrays.keys() == b.arrays.keys()
+    for name, array in a.arrays.items():
+        np.testing.assert_array_equal(array, b.arrays[name])
+        assert array.dtype == b.arrays[name].dtype
 
 
 def test_save_and_load(folder, dataset):
     loaded, manifest = load_dataset(folder, SPEC)
     assert_equal(loaded, dataset)
     assert manifest["env"] == "toy"
+    assert manifest["format"] == 2
+    assert {"rewards", "last_obs"} <= set(np.load(folder / ARRAYS))
     assert manifest["num_trajectories"] == 4
     assert manifest["num_steps"] == 17
     assert sorted(path.name for path in folder.iterdir()) == [MANIFEST, ARRAYS]
@@ -119,6 +120,8 @@ def test_slice(dataset):
     np.testing.assert_array_equal(part.lengths, [1, 9])
     np.testing.assert_array_equal(part.task_hashes, [101, 102])
     np.testing.assert_array_equal(part.obs[:, 0], [1] + [2] * 9)
+    np.testing.assert_array_equal(part.rewards, dataset.rewards[3:13])
+    np.testing.assert_array_equal(part.last_obs, [[1, 2], [2, 10]])
     assert_equal(dataset.slice(0, 4), dataset)
     gathered = part.gather(np.array([1]), np.array([9]), 9)
     np.testing.assert_array_equal(gathered.obs[0, :, 1], np.arange(1, 10))
@@ -254,7 +257,7 @@ FILE_DAMAGE = {
         lambda f: (f / MANIFEST).write_bytes(b"\xff\xfe\x80"),
         "not readable JSON.*collect it again",
     ),
-    "other format": (lambda f: sign(f, format=99), "has format 99, this version reads 1"),
+    "other format": (lambda f: sign(f, format=99), "has format 99, this version reads 1 and 2"),
 }
 
 
@@ -272,12 +275,12 @@ def test_no_folder(tmp_path):
 
 
 ARRAY_DAMAGE = {
-    "missing array": (lambda a: a.pop("goals"), "does not hold the arrays.*collect it again"),
+    "missing array": (lambda a: a.pop("achieved_goals"), "does not hold the arrays.*collect it again"),
     "unknown array": (lambda a: a.update(x=a["obs"]), "does not hold the arrays"),
     "NaN": (lambda a: a["obs"].__setitem__((5, 1), np.nan), "obs holds NaN .*first at step 5"),
     "infinity": (
-        lambda a: a["goals"].__setitem__((2, 0), np.inf),
-        "goals holds NaN or infinity, first at step 2",
+        lambda a: a["achieved_goals"].__setitem__((2, 0), np.inf),
+        "achieved_goals holds NaN or infinity, first at step 2",
     ),
     "too few steps": (
         lambda a: a.update(actions=a["actions"][:-1]),
@@ -296,8 +299,24 @@ ARRAY_DAMAGE = {
         r"obs is float32\[1\] a step, toy needs floating\[2\]",
     ),
     "goals of another world": (
-        lambda a: a.update(goals=a["goals"][:, :2]),
-        r"goals is float32\[2\] a step, toy needs floating\[3\]",
+        lambda a: a.update(achieved_goals=a["achieved_goals"][:, :2]),
+        r"achieved_goals is float32\[2\] a step, toy needs floating\[3\]",
+    ),
+    "goals as in format 1": (
+        lambda a: a.update(goals=a.pop("achieved_goals")),
+        "does not hold the arrays.*collect it again",
+    ),
+    "too few rewards": (
+        lambda a: a.update(rewards=a["rewards"][1:]),
+        r"rewards has shape \[16\], the lengths add up to 17 steps of 4 trajectories",
+    ),
+    "NaN after the last action": (
+        lambda a: a["last_obs"].__setitem__((3, 0), np.nan),
+        "last_obs holds NaN or infinity, first at trajectory 3",
+    ),
+    "a last observation for every step": (
+        lambda a: a.update(last_obs=a["obs"]),
+        r"last_obs has shape \[17, 2\], .* of 4 trajectories",
     ),
     "continuous actions": (
         lambda a: a.update(actions=a["actions"].astype(np.float32)),
@@ -321,7 +340,11 @@ ARRAY_DAMAGE = {
         "lengths must be a list of integers",
     ),
     "too long": (
-        lambda a: a.update(lengths=np.array([3, 14], np.int32), task_hashes=a["task_hashes"][:2]),
+        lambda a: a.update(
+            lengths=np.array([3, 14], np.int32),
+            task_hashes=a["task_hashes"][:2],
+            last_obs=a["last_obs"][:2],
+        ),
         "a trajectory has 14 steps, the horizon of toy is 9",
     ),
 }
@@ -342,7 +365,7 @@ def test_pickled_arrays_are_never_loaded(folder):
 
 
 def test_continuous_actions_have_bounds(dataset):
-    spec = replace(SPEC, discrete=False)
+    spec = replace(SPEC, actions=Box(4))
     actions = np.linspace(-1, 1, 17 * 4, dtype=np.float32).reshape(17, 4)
     check_dataset(replace(dataset, actions=actions), "here", spec)
     with pytest.raises(DataError, match=r"here: actions must lie in \[-1, 1\]"):
@@ -351,3 +374,73 @@ def test_continuous_actions_have_bounds(dataset):
 
 def test_check_without_a_world_accepts_any_sizes(dataset):
     check_dataset(replace(dataset, obs=dataset.obs[:, :1]), "here")
+
+
+def write_format_1(folder):
+    """Without rewards and last observations, and with another name for achieved goals."""
+
+    def change(arrays):
+        arrays["goals"] = arrays.pop("achieved_goals")
+        del arrays["rewards"], arrays["last_obs"]
+
+    rewrite(folder, change)
+    sign(folder, format=1)
+
+
+def test_datasets_of_format_1_are_read(folder, dataset):
+    write_format_1(folder)
+    loaded, manifest = load_dataset(folder, SPEC)
+    assert manifest["format"] == 1
+    assert_equal(loaded, replace(dataset, rewards=None, last_obs=None))
+    part, whole = (d.gather(np.array([2, 0]), np.array([5, 3]), 6) for d in (loaded, dataset))
+    for rows, others in zip(part, whole, strict=True):
+        np.testing.assert_array_equal(rows, others)
+    assert_equal(loaded.slice(1, 3), replace(dataset.slice(1, 3), rewards=None, last_obs=None))
+
+
+def test_a_dataset_of_format_1_without_goals(folder):
+    write_format_1(folder)
+    rewrite(folder, lambda arrays: arrays.pop("goals"))
+    with pytest.raises(DataError, match="does not hold the arrays.*collect it again"):
+        load_dataset(folder, SPEC)
+
+
+@pytest.mark.parametrize("name", ["rewards", "last_obs", "task_hashes"])
+def test_what_training_does_not_read_may_be_missing(folder, dataset, name):
+    rewrite(folder, lambda arrays: arrays.pop(name))
+    loaded, _ = load_dataset(folder, SPEC)
+    assert_equal(loaded, replace(dataset, **{name: None}))
+
+
+BYTES = replace(SPEC, obs=ArraySpec((3, 3), "uint8"))
+
+
+def with_pictures(dataset, dtype=np.uint8):
+    pictures = np.random.default_rng(2).integers(256, size=(17, 3, 3)).astype(dtype)
+    return replace(dataset, obs=pictures, last_obs=pictures[:4])
+
+
+def test_observations_keep_their_shape_and_dtype(tmp_path, dataset):
+    pictures = with_pictures(dataset)
+    save_dataset(tmp_path / "data", pictures, {})
+    assert np.load(tmp_path / "data" / ARRAYS)["obs"].dtype == np.uint8
+    loaded, _ = load_dataset(tmp_path / "data", BYTES)
+    assert_equal(loaded, pictures)
+    part = loaded.gather(np.array([3, 1]), np.array([2, 1]), 4)
+    assert part.obs.dtype == np.uint8
+    assert part.obs.shape == (2, 4, 3, 3)
+    np.testing.assert_array_equal(part.obs[0, :2], pictures.obs[13:15])
+    assert not part.obs[0, 2:].any()
+
+
+@pytest.mark.parametrize(
+    ("dtype", "spec", "says"),
+    [
+        (np.int32, BYTES, r"obs is int32\[3, 3\] a step, toy needs uint8\[3, 3\]"),
+        (np.float32, BYTES, r"obs is float32\[3, 3\] a step, toy needs uint8\[3, 3\]"),
+        (np.uint8, SPEC, r"obs is uint8\[3, 3\] a step, toy needs floating\[2\]"),
+    ],
+)
+def test_observations_of_another_kind(dataset, dtype, spec, says):
+    with pytest.raises(DataError, match=says):
+        check_dataset(with_pictures(dataset, dtype), "here", spec)

@@ -196,3 +196,89 @@ def test_a_mixture_explores_by_its_components():
     np.testing.assert_allclose(shares, WEIGHTS, atol=0.03)
     gaussian = Gaussian(jnp.asarray(MEAN), jnp.asarray(LOG_STD))
     np.testing.assert_array_equal(gaussian.explore(keys[0]), gaussian.sample(keys[0]))
+
+
+TEMPERATURES = [0.25, 0.7, 1.0, 3.0]
+
+
+def normalized(log_density, cells):
+    """Densities of log densities on a grid of cells of that size, to the power of 1 / temperature."""
+    density = np.exp(log_density - log_density.max())
+    return density / (density.sum() * cells)
+
+
+@pytest.mark.parametrize("temperature", TEMPERATURES)
+def test_tempered_categorical_against_brute_force(temperature):
+    tempered = Categorical(jnp.asarray(LOGITS)).tempered(jnp.float32(temperature))
+    expected = special.softmax(LOGITS.astype(np.float64)) ** (1 / temperature)
+    found = np.exp(jax.vmap(tempered.log_prob)(jnp.arange(5)))
+    np.testing.assert_allclose(found, expected / expected.sum(), rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize("temperature", TEMPERATURES)
+def test_tempered_gaussian_against_brute_force(temperature):
+    """Two dimensions on a grid, far beyond the actions: densities know no bounds."""
+    distribution = Gaussian(jnp.asarray(MEAN), jnp.asarray(LOG_STD))
+    line, step = np.linspace(-12, 12, 1601, retstep=True)
+    grid = jnp.asarray(np.stack(np.meshgrid(line, line[::8]), axis=-1).reshape(-1, 2), jnp.float32)
+    log_density = np.asarray(distribution.log_prob(grid), np.float64)
+    expected = normalized(log_density / temperature, step * 8 * step)
+    found = np.exp(distribution.tempered(jnp.float32(temperature)).log_prob(grid))
+    np.testing.assert_allclose(found, expected, atol=2e-3 * expected.max())
+
+
+@pytest.mark.parametrize("temperature", TEMPERATURES)
+def test_tempered_binned_against_brute_force(temperature):
+    """One dimension after the other; a value is as wide as all others, the first and the last included."""
+    distribution = Binned(2 * jax.random.normal(jax.random.key(0), (2, 11)))
+    line, step = np.linspace(-1.1, 1.1, 2200, endpoint=False, retstep=True)
+    line = line + step / 2
+    tempered = distribution.tempered(jnp.float32(temperature))
+    points = jnp.asarray(line, jnp.float32)[:, None]
+    for dimension in range(2):
+
+        def of_one(binned, row=dimension):
+            return np.asarray(Binned(binned.logits[row : row + 1]).log_prob(points), np.float64)
+
+        expected = normalized(of_one(distribution) / temperature, step)
+        np.testing.assert_allclose(np.exp(of_one(tempered)), expected, rtol=2e-3)
+
+
+@pytest.mark.parametrize("temperature", TEMPERATURES)
+def test_tempered_mixture_against_brute_force(temperature):
+    """Where its components do not overlap."""
+    log_stds = jnp.log(jnp.array([[0.05], [0.1], [0.02]]))
+    distribution = Mixture(jnp.log(WEIGHTS) + 3, jnp.array([[-3.0], [0.0], [3.0]]), log_stds)
+    line, step = np.linspace(-5, 5, 20_001, retstep=True)
+    grid = jnp.asarray(line, jnp.float32)[:, None]
+    log_density = np.asarray(jax.vmap(distribution.log_prob)(grid), np.float64)
+    expected = normalized(log_density / temperature, step)
+    tempered = distribution.tempered(jnp.float32(temperature))
+    found = np.exp(jax.vmap(tempered.log_prob)(grid))
+    np.testing.assert_allclose(found, expected, atol=2e-2 * expected.max())
+
+
+@pytest.mark.parametrize("name", HEADS)
+def test_temperature_1_is_the_distribution_itself(name):
+    params = jnp.linspace(-1.0, 1.0, HEADS[name].num_params(2))
+    distribution = HEADS[name].make(params)
+    tempered = distribution.tempered(jnp.float32(1.0))
+    assert type(tempered) is type(distribution)
+    jax.tree.map(np.testing.assert_array_equal, tempered, distribution)
+
+
+@pytest.mark.parametrize("name", HEADS)
+def test_temperature_0_in_the_limit_is_the_mode(name):
+    """For the binned head: the likeliest value, without its neighbors."""
+    params = jax.random.normal(jax.random.key(1), (HEADS[name].num_params(2),))
+    cold = HEADS[name].make(params).tempered(jnp.float32(1e-8))
+    keys = jax.random.split(jax.random.key(0), 20)
+    actions = np.asarray(jax.vmap(cold.explore)(keys))
+    width = 0.5 / 20 if name == "binned" else 1e-3
+    if name == "mixture":  # the weights of components of different spread are no guide to the mode
+        assert np.ptp(actions, axis=0).max() < width
+    else:
+        expected = np.asarray(HEADS[name].make(params).mode())
+        if name == "binned":
+            expected = np.linspace(-1, 1, 41)[np.asarray(cold.logits).argmax(axis=-1)]
+        np.testing.assert_allclose(actions, np.broadcast_to(expected, actions.shape), atol=width)

@@ -9,16 +9,16 @@ import jax
 import numpy as np
 import pytest
 
-from envs.experts.maze import maze_demonstrators
-from envs.maze_runner import MazeRunner
-from experiments.adaptation import run_adaptation
-from experiments.collect import collect
-from experiments.policies import LoadedPolicy
-from experiments.tasks import sample_tasks
-from mgpo_jax.checkpoint import network_config
-from mgpo_jax.optimizers import OPTIMIZERS
-from mgpo_jax.pretrain import TrainConfig, batch_stream, make_trainer
+from envs.maze.demonstrators import maze_demonstrators
+from envs.maze.env import MazeRunner
+from experiments.datasets import collect
+from mgpo_jax.policy import LoadedPolicy
+from mgpo_jax.runner import adapt
+from mgpo_jax.settings import TrainConfig
 from mgpo_jax.sharding import device_mesh
+from mgpo_jax.tasks import sample_tasks
+from mgpo_jax.training import Trainer, batch_stream
+from mgpo_jax.transformer import network_config
 
 ENV = MazeRunner(name="maze9", side=9, horizon=24)
 
@@ -29,11 +29,11 @@ def trained() -> tuple[list[float], LoadedPolicy]:
     demonstrator = maze_demonstrators(ENV)["astar4"]._replace(
         keeps=lambda episode: episode.trajectory.length >= 5
     )
-    dataset, _ = collect(ENV, demonstrator, 3000, seed=0)
+    dataset, _ = collect(ENV, demonstrator, 3000, seed=0, num_test_tasks=50)
     config = TrainConfig(steps=1500, batch_size=32, part_size=16, bucket=24, warmup_steps=20)
     config = TrainConfig(**{**vars(config), "learning_rate": 3e-3})
     network = network_config(ENV.spec, embed_dim=32, num_layers=2, dropout=0.0)
-    trainer = make_trainer(config, network, dataset, device_mesh(2))
+    trainer = Trainer(config, network, dataset, device_mesh(2))
     state, losses = trainer.init(), []
     for plans in islice(batch_stream(config, dataset, truncate=True, num_devices=2), config.steps):
         state, metrics = trainer.step(state, plans)
@@ -50,9 +50,7 @@ def test_pretraining_learns(trained: tuple[list[float], LoadedPolicy]) -> None:
 def test_adaptation_improves(trained: tuple[list[float], LoadedPolicy], name: str) -> None:
     """On unseen mazes the optimized prompt beats the prompt (g^M), and never loses to it."""
     tasks = sample_tasks(ENV, 77, 20)
-    outcome = run_adaptation(
-        ENV, trained[1], OPTIMIZERS[name], tasks, seeds=2, episodes=40, eval_every=20
-    )
+    outcome = adapt(ENV, trained[1], tasks, name, seeds=2, episodes=40, eval_every=20)
     initial, final = outcome.eval_returns[:, :, 0], outcome.eval_returns[:, :, -1]
     optimum = np.asarray(jax.vmap(partial(ENV.optimal_return))(tasks))
     assert (final >= initial - 1e-5).all()

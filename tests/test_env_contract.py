@@ -1,8 +1,12 @@
-"""What every world promises to the method, checked for each that ``envs.make`` knows."""
+"""What every world promises to the method, checked for each that ``envs.names`` lists."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,22 +14,31 @@ import numpy as np
 import pytest
 
 import envs
+from envs.base import ArraySpec, Box, Discrete, Engine, Environment, EnvSpec
+from envs.errors import NotAvailableError, UsageError
+from envs.registry import WORLDS
 
 
 def installed(name):
     try:
         return envs.make(name) is not None
-    except ImportError:
+    except UsageError:
         return False
 
 
-# Variants (kitchen-mjx) are one world with other physics, which tests/test_kitchen.py compares.
-NAMES = [name for name in envs.ENVIRONMENTS if "-" not in name and installed(name)]
+def parameters(names):
+    """Test parameters. Variants of a world (kitchen-stock) are slow."""
+    return [pytest.param(name, marks=pytest.mark.slow if "-" in name else ()) for name in names]
+
+
+NAMES = [name for name in envs.names() if installed(name)]
+# Worlds that only choose another engine (kitchen-mjx) are compared with theirs in tests/test_kitchen.py.
+PLAYED = [name for name in NAMES if envs.find(name).policy_of is None]
 NUM_TASKS = 256
 NUM_LANES = 16
 AFTER_END = 4  # steps beyond the horizon
 
-every_world = pytest.mark.parametrize("name", NAMES)
+every_world = pytest.mark.parametrize("name", parameters(NAMES))
 
 
 @partial(jax.jit, static_argnums=0)
@@ -72,7 +85,7 @@ play_many = jax.jit(
 )
 
 
-@pytest.fixture(scope="module", params=NAMES)
+@pytest.fixture(scope="module", params=parameters(PLAYED))
 def world(request):
     """A world, many of its tasks, and random play on the easiest, which it sometimes solves."""
     env = envs.make(request.param)
@@ -97,14 +110,16 @@ def world(request):
 def test_sizes_are_those_of_the_spec(name):
     env = envs.make(name)
     spec = env.spec
-    assert spec.name == name
-    assert isinstance(env, envs.Environment)
+    assert spec.name == envs.find(name).home
+    assert isinstance(env, Environment)
+    assert isinstance(env.engine, Engine)
     key = jax.random.key(0)
     task = jax.eval_shape(env.sample_task, key)
     state, first = jax.eval_shape(env.reset, key, task)
     action = jax.ShapeDtypeStruct(
         *(((), jnp.int32) if spec.discrete else ((spec.action_dim,), jnp.float32))
     )
+    assert jax.eval_shape(spec.zero_action) == action
     next_state, timestep = jax.eval_shape(env.step, state, action)
 
     def shapes(tree):
@@ -115,8 +130,8 @@ def test_sizes_are_those_of_the_spec(name):
     assert shapes(timestep) == shapes(first)
     scalar, flag = ((), jnp.float32), ((), jnp.bool_)
     assert shapes(timestep)._asdict() == {
-        "obs": ((spec.obs_dim,), jnp.float32),
-        "goal": ((spec.goal_dim,), jnp.float32),
+        "obs": (spec.obs.shape, spec.obs.dtype),
+        "achieved_goal": ((spec.goal_dim,), jnp.float32),
         "goal_reached": flag,
         "outcome": ((spec.goal_dim,), jnp.float32),
         "reward": scalar,
@@ -139,12 +154,12 @@ def test_equal_worlds_share_one_program(name):
 
     @partial(jax.jit, static_argnums=0)
     def draw(env, key):
-        traces.append(env.spec.name)
+        traces.append(env)
         return env.sample_goal(key)
 
     for seed in range(3):
         draw(envs.make(name), jax.random.key(seed))
-    assert traces == [name]
+    assert traces == [envs.make(name)]
     assert envs.make(name) == envs.make(name)
     assert hash(envs.make(name)) == hash(envs.make(name))
 
@@ -180,7 +195,7 @@ def test_episodes_end_once_and_absorb(world):
         # From there on nothing changes and nothing is earned.
         assert unchanged[lane, end + 1 :].all()
         assert (steps.reward[lane, end + 1 :] == 0).all()
-        for field in ("obs", "goal", "outcome", "terminated", "truncated"):
+        for field in ("obs", "achieved_goal", "outcome", "terminated", "truncated"):
             rows = getattr(steps, field)[lane, end:]
             assert (rows == rows[0]).all(), field
         # While the episode runs, at least a step counter moves.
@@ -231,6 +246,191 @@ def test_prompt_goals_vary(world):
     assert len(np.unique(goals, axis=0)) > 1
 
 
+def test_tasks_of_another_shape_are_refused(world):
+    env, tasks = world["env"], jax.tree.map(np.asarray, world["tasks"])
+    for index, leaf in enumerate(jax.tree.leaves(tasks)):
+        for bad in (leaf[:, None], leaf[..., :-1], leaf + 0.5, leaf.astype(str)):
+            leaves = list(jax.tree.leaves(tasks))
+            leaves[index] = bad
+            with pytest.raises(ValueError, match=r"must (have shape|hold)"):
+                env.check_task(jax.tree.unflatten(jax.tree.structure(tasks), leaves))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_records(name):
+    """What generic code reads of a world: its demonstrators, settings and judgement."""
+    world = envs.find(name)
+    assert world.name == name
+    assert world.summary
+    known = world.demonstrators(world.make())
+    assert all(isinstance(one, envs.Demonstrator) for one in known.values())
+    assert set(world.presets) == {"fast", "paper"}
+    for settings in world.presets.values():
+        assert settings["steps"] > 0
+        assert settings["episodes"] > 0
+        assert settings.get("demonstrator") in {None, *known}
+    assert (world.judged.episodes > 1) == (not world.make().spec.deterministic)
+    if world.policy_of is not None:
+        assert world.make().spec == envs.make(world.policy_of).spec
+
+
+def test_listing_worlds_imports_no_jax():
+    code = (
+        "import sys, envs; [envs.find(name) for name in envs.names()]; "
+        "assert not {'jax', 'numpy', 'mujoco', 'matplotlib'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+class Piece(NamedTuple):
+    """A task with one array of each kind."""
+
+    place: jax.Array
+    weight: jax.Array
+    marks: jax.Array
+
+
+@dataclass(frozen=True)
+class Bare(Environment):
+    """A world that leaves everything at its default."""
+
+    num: int = 3
+    spec = EnvSpec(
+        name="bare", obs=ArraySpec((4, 4, 3), "uint8"), goal_dim=2, actions=Discrete(2), horizon=5,
+        return_range=(0.0, 1.0),
+    )  # fmt: skip
+
+    def sample_task(self, key):
+        place = jax.random.randint(key, (2,), 0, 100)
+        return Piece(place, jax.random.uniform(key), jax.random.bernoulli(key, 0.5, (self.num,)))
+
+
+class TestDefaults:
+    env = Bare()
+
+    def tasks(self, num=4):
+        tasks = jax.vmap(self.env.sample_task)(jax.random.split(jax.random.key(0), num))
+        return jax.tree.map(np.array, tasks)
+
+    def test_specs(self):
+        spec = self.env.spec
+        assert str(spec.obs) == "uint8[4, 4, 3]"
+        assert spec.obs.size == 48
+        assert not spec.obs.is_float
+        assert (spec.discrete, spec.action_dim, spec.zero_action().shape) == (True, 2, ())
+        assert (spec.deterministic, spec.reward_confirms_goals) == (True, False)
+        assert ArraySpec((2,)).is_float
+        assert Box(2) != Discrete(2)
+
+    def test_a_world_must_say_what_it_is(self):
+        bare, key = Environment(), jax.random.key(0)
+        for missing in (
+            lambda: bare.spec,
+            lambda: bare.sample_task(key),
+            lambda: bare.task_goal(None),
+            lambda: bare.reset(key, None),
+            lambda: bare.step(None, jnp.zeros(())),
+        ):
+            with pytest.raises(NotImplementedError):
+                missing()
+
+    def test_the_optimum_is_unknown(self):
+        best = jax.jit(self.env.optimal_return)(self.env.sample_task(jax.random.key(0)))
+        assert best.shape == ()
+        assert np.isnan(best)
+
+    def test_goals_are_not_drawn(self):
+        with pytest.raises(NotAvailableError, match="bare draws no goals at random"):
+            self.env.sample_goal(jax.random.key(0))
+
+    def test_the_engine_wants_nothing_special(self):
+        assert self.env.engine == Engine(worlds_together=1, compiler_options=())
+
+    def test_equal_worlds_are_equal(self):
+        assert Bare() == Bare()
+        assert hash(Bare()) == hash(Bare())
+        assert Bare(4) != Bare()
+
+    def test_fingerprints_tell_tasks_apart(self):
+        tasks = self.tasks(64)
+        fingerprint = jax.jit(jax.vmap(self.env.fingerprint))
+        prints = np.asarray(fingerprint(tasks))
+        assert prints.dtype == np.int32
+        assert len(np.unique(prints, axis=0)) == 64
+        np.testing.assert_array_equal(prints, fingerprint(self.tasks(64)))
+        # Every array counts, and every bit of it.
+        for index, change in enumerate((1, np.spacing(tasks.weight), True)):
+            leaves = list(tasks)
+            leaves[index] = leaves[index] + change if index < 2 else ~leaves[index]
+            others = np.asarray(fingerprint(Piece(*leaves)))
+            assert (others != prints).any(axis=1).all()
+
+    def test_good_tasks(self):
+        tasks = self.tasks()
+        self.env.check_task(tasks)
+        self.env.check_task(tasks._replace(place=tasks.place.astype(np.int64)))
+        self.env.check_task(tasks._replace(weight=np.ones(4, np.int8)))  # 1 is a number
+        self.env.check_task(jax.tree.map(jnp.asarray, tasks))
+
+    @pytest.mark.parametrize(
+        ("field", "change", "message"),
+        [
+            ("place", lambda leaf: leaf[0], r"place must have shape \[N, 2\], found \[2\]"),
+            ("place", lambda leaf: leaf.T, r"place must have shape \[N, 2\], found \[2, 4\]"),
+            ("weight", lambda leaf: leaf[:3], r"weight must have shape \[4\], found \[3\]"),
+            ("marks", lambda leaf: leaf[:, :1], r"marks must have shape \[4, 3\], found \[4, 1\]"),
+            ("place", lambda leaf: leaf + 0.5, "place must hold integers, found float"),
+            ("place", lambda leaf: leaf > 1, "place must hold integers, found bool"),
+            ("weight", lambda leaf: leaf > 1, "weight must hold numbers, found bool"),
+            ("marks", lambda leaf: leaf + 0, "marks must hold booleans, found int"),
+            ("weight", lambda leaf: leaf / 0, "weight holds NaN or infinity"),
+        ],
+    )
+    @pytest.mark.filterwarnings("ignore:divide by zero")
+    def test_bad_tasks(self, field, change, message):
+        tasks = self.tasks()
+        with pytest.raises(ValueError, match=message):
+            self.env.check_task(tasks._replace(**{field: change(getattr(tasks, field))}))
+
+
+class TestRegistry:
+    """Worlds of one's own, on a copy of the registry."""
+
+    @pytest.fixture(autouse=True)
+    def _copy(self, monkeypatch, tmp_path):
+        monkeypatch.setattr(WORLDS, "_records", dict(WORLDS._records))
+        monkeypatch.setattr(sys, "path", [*sys.path])
+        monkeypatch.chdir(tmp_path)
+
+    def test_a_registered_world(self):
+        world = envs.World(name="bare", make=Bare)
+        assert envs.register(world) is world
+        assert envs.find("bare") is world
+        assert envs.make("bare") == Bare()
+        assert "bare" in envs.names()
+        # What it does not say has a default.
+        assert dict(world.demonstrators(Bare())) == {}
+        assert (world.home, world.pictures, world.num_test_tasks) == ("bare", None, 50)
+        assert world.judged == envs.Judgement(mode="greedy", temperature=1.0, episodes=1)
+        envs.register(world)  # twice the same is no conflict
+        for name in ("bare", "maze15"):
+            with pytest.raises(UsageError, match=f"there is a world '{name}' already"):
+                envs.register(envs.World(name=name, make=lambda: Bare(4)))
+
+    def test_a_world_of_a_file_here(self, tmp_path):
+        (tmp_path / "own_world.py").write_text(
+            "import envs\nWORLD = envs.World(name='own', make=lambda: envs.make('maze15'))\nNO = 3"
+        )
+        assert envs.find("own_world:WORLD").name == "own"
+        assert envs.make("own_world:WORLD") == envs.make("maze15")
+        with pytest.raises(UsageError, match="own_world:NO is a int, not a World record"):
+            envs.find("own_world:NO")
+        with pytest.raises(UsageError, match="cannot load the world 'own_world:OTHER'"):
+            envs.find("own_world:OTHER")
+        with pytest.raises(UsageError, match="cannot load the world 'nowhere:WORLD'"):
+            envs.find("nowhere:WORLD")
+
+
 class TestUnknownNames:
     @pytest.mark.parametrize(("wrong", "right"), [("maze16", "maze1[56]"), ("Maze30", "maze30")])
     def test_the_nearest_name_is_offered(self, wrong, right):
@@ -238,7 +438,7 @@ class TestUnknownNames:
             envs.make(wrong)
 
     def test_nothing_is_offered_for_what_is_like_none(self):
-        with pytest.raises(ValueError, match="unknown environment 'zzz'") as raised:
+        with pytest.raises(ValueError, match="unknown world 'zzz'") as raised:
             envs.make("zzz")
         assert "did you mean" not in str(raised.value)
         assert all(name in str(raised.value) for name in NAMES)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from mgpo_jax.errors import DataError
+from envs.errors import DataError
 from mgpo_jax.files import new_folder
 
 

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 
 import envs
-from envs.experts import demonstrators
-from envs.grid_world import GridTask
-from experiments.collect import collect
-from experiments.tasks import benchmark_tasks, task_hashes
-from mgpo_jax.rollout import run_episode
+from envs.episodes import run_episode
+from envs.gridworld.env import GridTask
+from experiments.datasets import collect
+from mgpo_jax.tasks import benchmark_tasks, task_hashes
 
 WORLD = envs.make("gridworld")
-EXPERT = demonstrators(WORLD)["expert"]
+EXPERT = envs.find("gridworld").demonstrators(WORLD)["expert"]
 HORIZON = 90
 NUM_TASKS = 13_650
 NUM_TEST_TASKS = 50
@@ -35,9 +34,9 @@ def episodes(keys, orders):
     """Episodes of the demonstrator."""
 
     def episode(key, order):
-        return run_episode(key, WORLD, EXPERT.agent, GridTask(order), "lanes")
+        return run_episode(key, WORLD, EXPERT.agent(EXPERT.weights), GridTask(order))
 
-    return jax.vmap(episode, axis_name="lanes")(keys, orders)
+    return jax.vmap(episode)(keys, orders)
 
 
 def num_steps(starts, orders) -> np.ndarray:
@@ -69,13 +68,13 @@ def expert(all_orders):
 @pytest.fixture(scope="module")
 def one_pass():
     """A dataset of as many episodes as there are tasks to train on, and facts about it."""
-    return collect(WORLD, EXPERT, ONE_PASS, 0)
+    return collect(WORLD, EXPERT, ONE_PASS, seed=0, num_test_tasks=NUM_TEST_TASKS)
 
 
 @pytest.fixture(scope="module")
 def training_orders(all_orders):
     """The orders of that dataset: all in turn, without those of the test."""
-    tests = task_hashes(WORLD, benchmark_tasks(WORLD))
+    tests = task_hashes(WORLD, benchmark_tasks(WORLD, NUM_TEST_TASKS))
     return all_orders[~np.isin(task_hashes(WORLD, GridTask(all_orders)), tests)]
 
 
@@ -109,7 +108,7 @@ class TestExpert:
         orders, _, trajectory, _ = expert
         for order, goals, reached, actions, outcomes, length in zip(
             orders,
-            trajectory.goals,
+            trajectory.achieved_goals,
             trajectory.goal_reached,
             trajectory.actions,
             trajectory.outcomes,
@@ -132,7 +131,7 @@ class TestExpert:
         before, after = trajectory.obs[:, :-1], trajectory.obs[:, 1:]
         moved = (after - before)[..., 7:] == MOVES[trajectory.actions[:, :-1]]
         assert moved[later].all()
-        switched = (after - before)[..., :7] == trajectory.goals[:, :-1]
+        switched = (after - before)[..., :7] == trajectory.achieved_goals[:, :-1]
         assert switched[later].all()
         assert (trajectory.obs[:, 0, :7] == 0).all()
         for rows in trajectory[:-1]:
@@ -190,7 +189,7 @@ class TestLengths:
 
 class TestDataset:
     def test_benchmark_tasks_are_50_different_ones(self, all_orders):
-        tasks = jax.tree.map(np.asarray, benchmark_tasks(WORLD))
+        tasks = jax.tree.map(np.asarray, benchmark_tasks(WORLD, NUM_TEST_TASKS))
         WORLD.check_task(tasks)
         assert len(np.unique(tasks.order, axis=0)) == NUM_TEST_TASKS
         assert set(map(tuple, tasks.order)) < set(map(tuple, all_orders))
@@ -203,7 +202,7 @@ class TestDataset:
         assert len(dataset) == ONE_PASS == len(training_orders)
         expected = task_hashes(WORLD, GridTask(training_orders))
         np.testing.assert_array_equal(dataset.task_hashes, expected)
-        tests = task_hashes(WORLD, benchmark_tasks(WORLD))
+        tests = task_hashes(WORLD, benchmark_tasks(WORLD, NUM_TEST_TASKS))
         assert not np.isin(dataset.task_hashes, tests).any()
         assert facts["dropped_test_tasks"] >= NUM_TEST_TASKS
         assert facts["hindsight_return"]["mean"] == 1
@@ -211,7 +210,7 @@ class TestDataset:
     def test_goals_are_the_orders_of_the_tasks(self, one_pass, training_orders):
         """Hindsight sees what was switched on, in the order of the task."""
         dataset, _ = one_pass
-        reached = np.argmax(dataset.goals[dataset.goal_reached], axis=1)
+        reached = np.argmax(dataset.achieved_goals[dataset.goal_reached], axis=1)
         np.testing.assert_array_equal(reached, training_orders[training_orders >= 0])
         assert dataset.goal_reached[dataset.starts + dataset.lengths - 1].all()
         final = dataset.outcomes[dataset.starts + dataset.lengths - 1]
@@ -226,10 +225,10 @@ class TestDataset:
 
     def test_seeds_change_the_episodes_and_not_the_tasks(self, one_pass):
         dataset, _ = one_pass
-        again, _ = collect(WORLD, EXPERT, 100, 0)
-        other, _ = collect(WORLD, EXPERT, 100, 1)
+        again, _ = collect(WORLD, EXPERT, 100, seed=0, num_test_tasks=NUM_TEST_TASKS)
+        other, _ = collect(WORLD, EXPERT, 100, seed=1, num_test_tasks=NUM_TEST_TASKS)
         first = dataset.slice(0, 100)
-        for name, array in vars(again).items():
+        for name, array in again.arrays.items():
             np.testing.assert_array_equal(array, getattr(first, name), err_msg=name)
         np.testing.assert_array_equal(other.task_hashes, first.task_hashes)
         same = (other.obs[other.starts] == first.obs[first.starts]).all(axis=1)
@@ -237,5 +236,5 @@ class TestDataset:
 
 
 def test_demonstrators_by_name():
-    known = demonstrators(WORLD)
+    known = envs.find("gridworld").demonstrators(WORLD)
     assert list(known) == ["expert"]

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 import envs
 from envs.base import TimeStep
-from envs.grid_world import EAST, FLIP, NORTH, SOUTH, STAY, WEST, GridTask, GridWorld
+from envs.gridworld.env import EAST, FLIP, NORTH, SOUTH, STAY, WEST, GridTask, GridWorld
 
 WORLD = envs.make("gridworld")
 HORIZON = 90
@@ -76,7 +76,7 @@ class Oracle:
         complete = self.num_paid == len(self.order)
         return TimeStep(
             obs=np.array([*multi_hot(self.on), *self.cell]),
-            goal=multi_hot([] if reached is None else [reached]),
+            achieved_goal=multi_hot([] if reached is None else [reached]),
             goal_reached=reached is not None,
             outcome=multi_hot(self.visited),
             reward=reward,
@@ -147,7 +147,7 @@ def assert_same_episode(steps: TimeStep, expected: list[TimeStep]) -> None:
 
 def test_sizes():
     spec = WORLD.spec
-    assert (spec.obs_dim, spec.goal_dim, spec.action_dim) == (9, 7, 6)
+    assert (spec.obs.shape, spec.goal_dim, spec.action_dim) == ((9,), 7, 6)
     assert spec.discrete
     assert spec.horizon == HORIZON
     assert spec.return_range == (0, 1)
@@ -169,7 +169,7 @@ def test_objects_are_where_the_map_has_them():
         start = (row, 0)
         _, steps = walk_from(start, [0, 1, 2, 3, 4, 5, 6], coded("FE" * 9 + "F"))
         flipped = {
-            (row, time // 2): int(np.argmax(steps.goal[time]))
+            (row, time // 2): int(np.argmax(steps.achieved_goal[time]))
             for time in np.flatnonzero(steps.goal_reached)
         }
         assert flipped == {cell: index for cell, index in drawn.items() if cell[0] == row}
@@ -275,7 +275,7 @@ class TestGolden:
             assert steps.reward[time] == pytest.approx(int(paid) / len(order)), say
             assert steps.goal_reached[time] == (goal != "-"), say
             expected = multi_hot([] if goal == "-" else [int(goal)])
-            np.testing.assert_array_equal(steps.goal[time], expected, err_msg=say)
+            np.testing.assert_array_equal(steps.achieved_goal[time], expected, err_msg=say)
             np.testing.assert_array_equal(steps.outcome[time], drawn_objects(visited), err_msg=say)
         num = len(lines)
         assert not steps.terminated[: num - 1].any()
@@ -300,7 +300,7 @@ class TestGolden:
         assert not first.terminated
         assert not first.truncated
         assert first.reward == 0
-        assert (first.goal == 0).all()
+        assert (first.achieved_goal == 0).all()
         assert (first.outcome == 0).all()
 
     @pytest.mark.parametrize(
@@ -453,7 +453,7 @@ def test_returns_are_shares_of_one(start, objects, num_objects, plan):
     assert (return_ > 1 - 1e-6) == steps.terminated[-1]
     # Each object is a goal once, and the outcome is their set.
     num = int(np.argmax(steps.terminated | steps.truncated)) + 1
-    goals = steps.goal[:num][steps.goal_reached[:num]]
+    goals = steps.achieved_goal[:num][steps.goal_reached[:num]]
     np.testing.assert_array_equal(goals.sum(axis=0), steps.outcome[-1])
     assert (goals.sum(axis=1) == 1).all()
     if expected:

@@ -18,17 +18,11 @@ import pytest
 from conftest import require_kitchen
 from jax.sharding import PartitionSpec
 
-from envs.experts import demonstrators
-from envs.kitchen import (
-    NONE,
-    SUBTASKS,
-    Kitchen,
-    KitchenTask,
-    MissingExtraError,
-    NoOpenGLError,
-    extra,
-)
-from experiments.runtime import jit_with
+import envs
+from envs.kitchen import MissingExtraError, NoOpenGLError, extra
+from envs.kitchen.demonstrators import kitchen_demonstrators
+from envs.kitchen.env import NONE, SUBTASKS, Kitchen, KitchenTask
+from envs.kitchen.fidelity import jit_for
 from mgpo_jax.sharding import device_mesh
 
 require_kitchen()
@@ -65,7 +59,7 @@ def stepper(env):
 
 @cache
 def many_stepper(env):
-    return jit_with(env)(jax.vmap(env.step))
+    return jit_for(env)(jax.vmap(env.step))
 
 
 def begin(order, env=WORLD):
@@ -105,7 +99,7 @@ class TestRules:
         state, timestep = wait(put(begin([subtask]), subtask))
         assert timestep.reward == 1
         assert timestep.goal_reached
-        np.testing.assert_array_equal(timestep.goal, multi_hot([subtask]))
+        np.testing.assert_array_equal(timestep.achieved_goal, multi_hot([subtask]))
         np.testing.assert_array_equal(timestep.outcome, multi_hot([subtask]))
         assert timestep.terminated
         assert state.done
@@ -124,7 +118,7 @@ class TestRules:
         state = begin([MICROWAVE, LIGHT])
         for subtask in (LIGHT, MICROWAVE):
             state, timestep = wait(put(state, subtask))
-            np.testing.assert_array_equal(timestep.goal, multi_hot([subtask]))
+            np.testing.assert_array_equal(timestep.achieved_goal, multi_hot([subtask]))
             assert timestep.reward == 0
         assert not timestep.terminated
         np.testing.assert_array_equal(timestep.outcome, multi_hot([LIGHT, MICROWAVE]))
@@ -149,15 +143,15 @@ class TestRules:
     def test_two_at_once_count_one_after_the_other(self):
         state, first = wait(put(begin([SLIDE, HINGE]), SLIDE, HINGE))
         _, second = wait(state)
-        np.testing.assert_array_equal(first.goal, multi_hot([SLIDE]))
-        np.testing.assert_array_equal(second.goal, multi_hot([HINGE]))
+        np.testing.assert_array_equal(first.achieved_goal, multi_hot([SLIDE]))
+        np.testing.assert_array_equal(second.achieved_goal, multi_hot([HINGE]))
         assert first.reward == second.reward == 0.5
 
     def test_of_two_at_once_the_next_of_the_task_counts_first(self):
         state, first = wait(put(begin([HINGE, SLIDE]), SLIDE, HINGE))
         _, second = wait(state)
-        np.testing.assert_array_equal(first.goal, multi_hot([HINGE]))
-        np.testing.assert_array_equal(second.goal, multi_hot([SLIDE]))
+        np.testing.assert_array_equal(first.achieved_goal, multi_hot([HINGE]))
+        np.testing.assert_array_equal(second.achieved_goal, multi_hot([SLIDE]))
         assert first.reward == second.reward == 0.5
 
     def test_the_horizon_truncates_and_absorbs(self):
@@ -192,9 +186,10 @@ class TestTasks:
         WORLD.check_task(KitchenTask(orders))
 
     def test_a_split_of_25_test_tasks_leaves_300(self):
-        from experiments.tasks import benchmark_tasks, task_hashes
+        from mgpo_jax.tasks import benchmark_tasks, task_hashes
 
-        tests = set(task_hashes(WORLD, benchmark_tasks(WORLD)).tolist())
+        num = envs.find("kitchen").num_test_tasks
+        tests = set(task_hashes(WORLD, benchmark_tasks(WORLD, num)).tolist())
         everything = jax.vmap(WORLD.task)(jnp.arange(NUM_TASKS))
         assert len(tests) == 25
         assert len(set(task_hashes(WORLD, everything).tolist()) - tests) == 300
@@ -247,14 +242,14 @@ class TestBadInput:
             return "3.17.0"
 
         monkeypatch.setattr(extra, "version", version)
-        with pytest.raises(MissingExtraError, match=rf'{package}: pip install -e "\.\[kitchen\]"'):
+        with pytest.raises(MissingExtraError, match=rf"{package}: pip install -e \.$"):
             extra.check_extra()
 
     def test_demonstrators_of_a_world_made_by_hand(self, monkeypatch):
         versions = {"mujoco": "4.0.0", "mujoco-mjx": "3.17.0"}
         monkeypatch.setattr(extra, "version", versions.get)
         with pytest.raises(MissingExtraError, match=r"pip install"):
-            demonstrators(WORLD)
+            kitchen_demonstrators(WORLD)
 
     def test_a_wrong_pair(self, monkeypatch):
         versions = {"mujoco": "4.0.0", "mujoco-mjx": "3.17.0"}
@@ -314,7 +309,7 @@ def test_an_opengl_that_is_not_there(library):
     """MuJoCo looks for it when it is imported."""
     code = (
         "import ctypes, ctypes.util as util; util.find_library = lambda name: None\n"
-        "import envs\ntry: envs.make('kitchen')\n"
+        "import envs\ntry: envs.find('kitchen').make()\n"
         "except ImportError as error: print(type(error).__name__, error)\n"
         "else: print('found')"
     )
@@ -334,8 +329,9 @@ def test_an_opengl_that_is_not_there(library):
 
 def test_other_worlds_do_not_load_physics():
     code = (
-        "import sys, envs; from envs.experts import demonstrators; "
-        "demonstrators(envs.make('gridworld')); assert 'mujoco' not in sys.modules"
+        "import sys, envs; "
+        "envs.find('gridworld').demonstrators(envs.make('gridworld')); "
+        "assert 'mujoco' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 
@@ -396,7 +392,7 @@ class TestNative:
 def kitchen():
     """FrankaKitchen of gymnasium-robotics."""
     pytest.importorskip("gymnasium_robotics")
-    from experiments.fidelity import gymnasium_kitchen
+    from envs.kitchen.fidelity import gymnasium_kitchen
 
     return gymnasium_kitchen()
 
@@ -439,7 +435,7 @@ class TestOracle:
 def test_one_step_of_mjx_is_one_of_native():
     actions = random_actions(5, 3)
     after = [
-        jit_with(env)(
+        jit_for(env)(
             jax.vmap(lambda action, env=env: env.step(begin([LIGHT], env), action)[1].obs)
         )(actions)
         for env in (WORLD, MJX)
@@ -452,17 +448,19 @@ def test_accelerators_call_c_through_a_pure_callback(monkeypatch):
     state, action = begin([LIGHT]), jnp.asarray(random_actions(6))
     expected, _ = stepper(WORLD)(state, action)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    found, _ = jax.jit(Kitchen("kitchen", HORIZON, "native").step)(state, action)
+    found, _ = jax.jit(Kitchen(name="kitchen", horizon=HORIZON, backend="native").step)(
+        state, action
+    )
     for one, other in zip(found.physics, expected.physics, strict=True):
         np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.slow
 def test_mjx_follows_native():
-    from experiments.fidelity import random_actions, record
+    from envs.kitchen.fidelity import kitchen, random_actions, record
 
     actions = random_actions(4, 20)
-    native, mjx = (record(Kitchen("kitchen", 20, name), actions).obs for name in ("native", "mjx"))
+    native, mjx = (record(kitchen(name, horizon=20), actions).obs for name in ("native", "mjx"))
     errors = np.abs(mjx - native)
     assert errors.max() < 5e-3
     assert np.median(errors) < 1e-5

@@ -9,15 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 from conftest import require_kitchen
 
-from envs.experts import demonstrators
-from envs.kitchen import NONE, SUBTASKS, Kitchen, KitchenTask
+from envs.kitchen.env import NONE, SUBTASKS, Kitchen, KitchenTask
 
 require_kitchen()
 import mujoco  # noqa: E402
 
-from envs.experts.kitchen import HIGH, LOW, make_plan, scripted_arm  # noqa: E402
+import envs  # noqa: E402
 from envs.kitchen.arm import PAD, arm_pose, make_arm, rotation_vector, turn  # noqa: E402
+from envs.kitchen.demonstrators import HIGH, LOW, scripted_arm  # noqa: E402
 from envs.kitchen.model import load_model  # noqa: E402
+from envs.kitchen.phases import make_plan  # noqa: E402
 
 WORLD = Kitchen(name="kitchen", horizon=500)
 
@@ -38,7 +39,7 @@ def play():
             following, _, memory = agent.proceed(
                 jax.random.fold_in(key, time), memory, state, timestep
             )
-            return (state, following, memory), (timestep.reward, timestep.goal, action)
+            return (state, following, memory), (timestep.reward, timestep.achieved_goal, action)
 
         return jax.lax.scan(step, (state, action, memory), jnp.arange(WORLD.horizon))[1]
 
@@ -116,5 +117,5 @@ class TestExpert:
         assert rewards.sum(axis=1).mean() > 0.9
 
     def test_by_name(self):
-        known = demonstrators(WORLD)
+        known = envs.find("kitchen").demonstrators(WORLD)
         assert list(known) == ["expert"]

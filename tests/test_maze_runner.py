@@ -10,7 +10,7 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from envs.maze_runner import (
+from envs.maze.env import (
     EAST,
     NORTH,
     SOUTH,
@@ -148,9 +148,9 @@ class TestObservation:
 
     def test_goal_and_outcome_are_the_position(self):
         first, positions, steps = walk_tiny(parse(TINY_MAP), TINY_WAY)
-        np.testing.assert_allclose(first.goal * 7, [5, 3], atol=1e-5)
-        np.testing.assert_allclose(steps.goal * 7, positions, atol=1e-5)
-        np.testing.assert_array_equal(steps.goal, steps.outcome)
+        np.testing.assert_allclose(first.achieved_goal * 7, [5, 3], atol=1e-5)
+        np.testing.assert_allclose(steps.achieved_goal * 7, positions, atol=1e-5)
+        np.testing.assert_array_equal(steps.achieved_goal, steps.outcome)
         assert first.goal_reached
         assert steps.goal_reached.all()
 
@@ -209,7 +209,7 @@ class TestStep:
     def test_walking_over_other_cells_is_no_goal(self):
         """Standing in the row or the column of the goal is not enough."""
         _, _, steps = walk_tiny(parse(TINY_MAP), TINY_WAY[:9])
-        assert steps.goal[5][0] == parse(TINY_MAP).goal[0] / jnp.float32(7)
+        assert steps.achieved_goal[5][0] == parse(TINY_MAP).goal[0] / jnp.float32(7)
         assert not steps.terminated.any()
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +12,8 @@ import pytest
 from scipy import stats
 
 import envs
-from envs.base import Environment, EnvSpec, TimeStep
-from envs.noisy import Noisy
+from envs.base import ArraySpec, Box, Environment, EnvSpec, TimeStep
+from envs.wrappers import Noisy
 
 MAZE = envs.make("maze15")
 NUM = 2000
@@ -24,9 +24,8 @@ class Echo(Environment):
     """A world of one step that shows the action it was given."""
 
     spec = EnvSpec(
-        name="echo", obs_dim=3, goal_dim=1, action_dim=3, discrete=False, horizon=1,
-        return_range=(0.0, 1.0), truncate_in_hindsight=False, deterministic=True,
-        reward_confirms_goals=False,
+        name="echo", obs=ArraySpec((3,)), goal_dim=1, actions=Box(3), horizon=1,
+        return_range=(0.0, 1.0),
     )  # fmt: skip
 
     def reset(self, key, task):
@@ -37,7 +36,10 @@ class Echo(Environment):
 
     def show(self, obs):
         no = jnp.zeros((), bool)
-        return TimeStep(obs, jnp.zeros(1), no, jnp.zeros(1), jnp.zeros(()), no, no)
+        return TimeStep(
+            obs=obs, achieved_goal=jnp.zeros(1), goal_reached=no, outcome=jnp.zeros(1),
+            reward=jnp.zeros(()), terminated=no, truncated=no,
+        )  # fmt: skip
 
 
 def steps(env, action):
@@ -68,6 +70,9 @@ def test_without_noise_nothing_changes():
     assert (noisy.task_goal(task) == MAZE.task_goal(task)).all()
     assert (noisy.fingerprint(task) == MAZE.fingerprint(task)).all()
     assert noisy.optimal_return(task) == MAZE.optimal_return(task)
+    assert noisy.engine == MAZE.engine
+    key = jax.random.key(4)
+    assert (noisy.sample_goal(key) == MAZE.sample_goal(key)).all()
     with pytest.raises(ValueError, match="maze"):
         noisy.check_task(task)
 
@@ -102,3 +107,21 @@ def test_refuses_what_is_no_noise():
             Noisy(Echo(), obs_noise=size)
     with pytest.raises(ValueError, match="a probability, found 2"):
         Noisy(MAZE, action_noise=2.0)
+
+
+def test_whole_numbers_take_no_noise():
+    """Observations of integers (pixels, codes) stay as they are, and noise on them is refused."""
+
+    @dataclass(frozen=True)
+    class Pixels(Echo):
+        spec = replace(Echo.spec, obs=ArraySpec((3,), "uint8"))
+
+        def show(self, obs):
+            return super().show(obs)._replace(obs=jnp.array([1, 2, 255], jnp.uint8))
+
+    _, after = steps(Noisy(Pixels(), action_noise=0.1), jnp.zeros(3))
+    assert after.dtype == np.uint8
+    assert (after == [1, 2, 255]).all()
+    message = r"those of echo are uint8\[3\]"
+    with pytest.raises(ValueError, match=message):
+        Noisy(Pixels(), obs_noise=0.1)

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from envs.base import Episode, Trajectory
 from mgpo_jax.optimizers import OPTIMIZERS, SearchSpace
 from mgpo_jax.optimizers.arms import (
     SHRINKAGE,
@@ -24,8 +25,8 @@ from mgpo_jax.optimizers.arms import (
 from mgpo_jax.optimizers.bpe import posterior, shortfall
 from mgpo_jax.optimizers.grips import edit
 from mgpo_jax.optimizers.ucb import upper_confidence_bounds
-from mgpo_jax.prompts import single_goal
-from mgpo_jax.types import Episode, Prompt, Query, Trajectory
+from mgpo_jax.prompts import Prompt, single_goal
+from mgpo_jax.rollout import Query
 
 NUM_SLOTS, NUM_STEPS, NUM_EPISODES = 4, 6, 24
 TASK_GOAL = jnp.array([0.9, 0.8])
@@ -34,7 +35,7 @@ BANDITS = ("ucb", "bpe", "explore")
 BLANK = Trajectory(
     obs=jnp.zeros((NUM_STEPS, 1)),
     actions=jnp.zeros(NUM_STEPS, jnp.int32),
-    goals=jnp.zeros((NUM_STEPS, 2)),
+    achieved_goals=jnp.zeros((NUM_STEPS, 2)),
     goal_reached=jnp.zeros(NUM_STEPS, bool),
     outcomes=jnp.zeros((NUM_STEPS, 2)),
     length=jnp.int32(0),
@@ -63,23 +64,28 @@ def play(key, query, spread):
     real = jnp.arange(NUM_STEPS) < length
     goals = jnp.where(real[:, None], goals, 0.0)
     trajectory = BLANK._replace(
-        goals=goals, goal_reached=real, outcomes=jnp.where(real[:, None], 2.0, 0.0), length=length
+        achieved_goals=goals,
+        goal_reached=real,
+        outcomes=jnp.where(real[:, None], 2.0, 0.0),
+        length=length,
     )
     mask = query.prompt.mask[:, None]
     distance = jnp.sum(query.prompt.goals * mask) / jnp.sum(2 * mask)
     noise = jnp.where(query.greedy, 0.0, 0.3 * jax.random.normal(key_noise))
     # Greedy returns in tenths, so that some tie.
     return_ = spread * (jnp.round(10 * (1 - distance)) / 10 + noise)
-    return Episode(trajectory, jnp.where(real & (goals[:, 0] > 0.6), 0.1, 0.0), return_)
+    rewards = jnp.where(real & (goals[:, 0] > 0.6), 0.1, 0.0)
+    return Episode(trajectory, rewards, return_, last_obs=jnp.zeros(1))
 
 
 def search(name, case, **options):
     space = SearchSpace(
-        NUM_SLOTS,
-        lambda key: jax.random.uniform(key, (2,)),
-        RANGE,
-        NUM_EPISODES,
-        case.max_goals,
+        num_slots=NUM_SLOTS,
+        horizon=NUM_STEPS,
+        return_range=RANGE,
+        num_episodes=NUM_EPISODES,
+        sample_goal=lambda key: jax.random.uniform(key, (2,)),
+        max_goals=case.max_goals,
         **options,
     )
     optimizer = OPTIMIZERS[name](space)
@@ -92,7 +98,7 @@ def search(name, case, **options):
         state = optimizer.tell(state, query, result)
         return state, Log(query, result, optimizer.best(state))
 
-    state = optimizer.init(key_init, TASK_GOAL, BLANK)
+    state = optimizer.init(key_init, TASK_GOAL)
     return jax.lax.scan(episode, state, jax.random.split(key_run, NUM_EPISODES))[1]
 
 
@@ -180,7 +186,9 @@ def test_algorithm_1_replayed(logs, name):
             elif query.greedy:
                 newest = prompt
                 best = np.flatnonzero(returns[:i] == returns[:i].max())[-1]  # ties: the newest
-                steps = listed(Prompt(log.episode.trajectory.goals[best], np.ones(NUM_STEPS, bool)))
+                steps = listed(
+                    Prompt(log.episode.trajectory.achieved_goals[best], np.ones(NUM_STEPS, bool))
+                )
                 steps = steps[: log.episode.trajectory.length[best]]
                 at = [steps.index(goal) for goal in prompt[:-1]]
                 assert at == sorted(set(at))
@@ -216,7 +224,9 @@ def test_a_world_of_chance(logs):
             acted = i % 2 == 1
             if i and not acted:
                 best = np.flatnonzero(returns[:i] == returns[:i].max())[-1]
-                goals = listed(Prompt(log.episode.trajectory.goals[best], np.ones(NUM_STEPS, bool)))
+                goals = listed(
+                    Prompt(log.episode.trajectory.achieved_goals[best], np.ones(NUM_STEPS, bool))
+                )
                 rewarded = [
                     goal
                     for goal, reward in zip(goals, log.episode.rewards[best], strict=True)
@@ -456,8 +466,14 @@ def test_the_optimized_prompt_is_not_the_luckiest_one():
 def test_hyper_parameters_can_be_swept_by_vmap():
     """The exploration constant is traced: c = 0 exploits, a large c balances the pulls."""
     arms = arms_of([[0.0], [1.0, 1.0, 1.0]])
-    space = SearchSpace(1, lambda key: jnp.zeros(2), (0.0, 1.0), 8)
-    state = OPTIMIZERS["ucb"](space).init(jax.random.key(0), TASK_GOAL, BLANK)
+    space = SearchSpace(
+        num_slots=1,
+        horizon=NUM_STEPS,
+        return_range=(0.0, 1.0),
+        num_episodes=8,
+        sample_goal=lambda key: jnp.zeros(2),
+    )
+    state = OPTIMIZERS["ucb"](space).init(jax.random.key(0), TASK_GOAL)
 
     def choice(c):
         query_state = state._replace(arms=arms, episode=jnp.int32(1))

@@ -2,31 +2,30 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import imageio.v3 as iio
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fakes import FakeResults, player
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
-import envs
-from envs import render
-from envs.maze_runner import NORTH, MazeRunner
-from experiments import figures, plot
-from experiments import results as results_module
-from experiments.figures import base, maze
+from envs.base import Episode, Trajectory
+from envs.drawing import Pictures, spread_apart
+from envs.maze import pictures as maze
+from envs.maze.env import NORTH, MazeRunner, MazeTask
+from experiments import figures
+from experiments.figures import rollouts
 from mgpo_jax.distributions import Categorical
-from mgpo_jax.errors import DataError, UsageError
 from mgpo_jax.policy import Policy
 
 SIDE = 7
 ENV = MazeRunner(name="tiny", side=SIDE, horizon=6)
+PICTURES = maze.maze_pictures(ENV)
 MAZE = np.array(
     [
         [1, 1, 1, 1, 1, 1, 1],
@@ -41,18 +40,6 @@ MAZE = np.array(
 START, GOAL = (5, 3), (1, 5)
 
 
-class Plain(envs.Environment):
-    """A world without pictures."""
-
-    spec = ENV.spec
-
-
-@pytest.fixture(autouse=True)
-def tiny_world(monkeypatch):
-    """The world that the results below name."""
-    monkeypatch.setitem(envs.ENVIRONMENTS, "tiny", lambda: ENV)
-
-
 def north_policy() -> Policy:
     """Always goes north: from the start up four cells, then against the wall."""
     north = Categorical(jnp.where(jnp.arange(5) == NORTH, 50.0, 0.0))
@@ -64,50 +51,32 @@ def north_policy() -> Policy:
     )
 
 
-NORTHWARD = north_policy()
+PLAY = player(ENV, north_policy())
 
 
-def fake_results(bandit: str = "ucb", shift: float = 0.0) -> results_module.Results:
+def fake_results(method: str = "ucb", shift: float = 0.0) -> FakeResults:
     """2 seeds, 2 tasks, 20 episodes, 3 slots; the best prompt gains a waypoint at episode 10."""
-    shape = (2, 2, 20, 3)
-    masks = np.zeros(shape, bool)
-    masks[..., -1] = True
-    masks[:, :, 9:, -2] = True
-    goals = np.zeros((*shape, 2), np.float32)
-    goals[..., -1, :] = np.array(GOAL) / SIDE
-    goals[:, :, 9:, -2, :] = np.array([3, 3]) / SIDE
+    goal = np.array([GOAL], np.float32) / SIDE
+    waypoint = np.array([[3, 3]], np.float32) / SIDE
+    found = {1: goal, 10: np.concatenate([waypoint, goal])}
     evals = np.array([[[-3.0, -1.0], [-1.0, 0.0]], [[-2.0, -1.0], [-2.0, 1.0]]]) + shift
-    return results_module.Results(
-        returns=np.full(shape[:3], -1.0, np.float32),
-        greedy=np.ones(shape[:3], bool),
-        prompt_goals=goals,
-        prompt_masks=masks,
-        best_goals=goals,
-        best_masks=masks,
+    return FakeResults(
+        tasks=[MazeTask(MAZE, np.array(GOAL)), MazeTask(MAZE, np.array((5, 1)))],
+        task_goals=np.array([GOAL, (5, 1)], np.float32) / SIDE,
+        found=[found, found],
         eval_episodes=np.array([1, 20]),
-        eval_returns=evals.astype(np.float32),
-        optimal_returns=np.array([0.5, 0.7], np.float32),
-        tasks={"maze": np.stack([MAZE, MAZE]), "goal": np.array([GOAL, (5, 1)])},
-        config={"env": "tiny", "bandit": bandit, "policy": None},
-        summary={},
+        eval_returns=evals,
+        optimal_returns=np.array([0.5, 0.7]),
+        num_episodes=20,
+        max_goals=3,
+        method=method,
     )
-
-
-def save_results(folder: Path, results: results_module.Results) -> Path:
-    folder.mkdir(parents=True)
-    np.savez(
-        folder / "results.npz", **{name: getattr(results, name) for name in results_module.AXES}
-    )
-    np.savez(folder / "tasks.npz", **results.tasks)
-    (folder / "config.json").write_text(json.dumps(results.config))
-    (folder / "summary.json").write_text("{}")
-    return folder
 
 
 def drawn(**options):
     """The axes of a drawn maze, and its discs as (label, row, column, color) in their order."""
     ax = Figure().add_subplot()
-    render.draw_maze(ax, MAZE, START, GOAL, **options)
+    maze.draw_maze(ax, MAZE, START, GOAL, **options)
     return ax, discs_of(ax)
 
 
@@ -127,16 +96,16 @@ def luminance(color) -> float:
 @pytest.mark.parametrize("side", [15, 31])
 def test_every_cell_is_found_again_from_its_goal(side):
     cells = np.argwhere(np.ones((side, side)))
-    placed = render.place_goals(cells.astype(np.float32) / np.float32(side), side)
+    placed = maze.place_goals(cells.astype(np.float32) / np.float32(side), side)
     np.testing.assert_array_equal(placed.cells, cells)
     assert not placed.outside.any()
 
 
 def test_goals_beyond_any_edge_are_outside():
     goals = [[-0.2, 0.5], [0.5, 1.1], [1.0, 0.5], [0.5, np.nan], [np.inf, 0.5], [1e30, -1e30]]
-    assert render.place_goals(np.array(goals), SIDE).outside.all()
+    assert maze.place_goals(np.array(goals), SIDE).outside.all()
     # The nearest cell counts: half a cell beyond the center of an edge cell is still inside.
-    assert not render.place_goals(np.array([[-0.4, 6.4]]) / SIDE, SIDE).outside.any()
+    assert not maze.place_goals(np.array([[-0.4, 6.4]]) / SIDE, SIDE).outside.any()
 
 
 def test_goals_are_numbered_discs_in_their_cells():
@@ -174,7 +143,7 @@ def test_a_crowded_bar_gets_more_lanes():
     goals = np.full((12, 2), 2.0)
     _, discs = drawn(prompt_goals=goals)
     assert len({(row, column) for _, row, column, _ in discs}) == 12
-    assert render.bar_lanes(SIDE, [goals]) == 3
+    assert maze.bar_lanes(SIDE, [goals]) == 3
     assert all(-0.5 < row < SIDE - 0.5 for _, row, _, _ in discs)
 
 
@@ -189,7 +158,7 @@ def test_prompts_keep_their_colors():
 def test_markers_in_one_cell_stay_near_it_without_hiding_each_other():
     homes = np.array([[5.0, 5.0]] * 4 + [[12.0, 3.0]])
     heavy = np.array([True, False, False, False, False])
-    points = render.spread_apart(homes, heavy, gap=1.0, limits=(0.1, 13.9))
+    points = spread_apart(homes, heavy, gap=1.0, limits=(0.1, 13.9))
     apart = np.linalg.norm(points[:, None] - points[None], axis=-1) + 9 * np.eye(5)
     assert apart.min() > 0.9
     assert np.linalg.norm(points - homes, axis=1).max() < 1.5
@@ -217,11 +186,15 @@ def test_paths_are_drawn_along_cells():
 
 
 def test_gif_shows_every_step(tmp_path):
-    walk = np.array([[4, 3], [3, 3], [3, 4], [3, 5]])
-    render.maze_gif(tmp_path / "walk.gif", MAZE, START, GOAL, walk, np.array([[3, 3]]) / SIDE)
+    walk = np.array([START, (4, 3), (3, 3), (3, 4), (3, 5)])
+    panels = [maze.Panel("", walk[:3]), maze.Panel("a prompt", walk, np.array([[3, 3]]) / SIDE)]
+    maze.maze_gif(tmp_path / "walk.gif", MAZE, START, GOAL, panels)
     frames = iio.imread(tmp_path / "walk.gif")
     assert len(frames) == 5  # the start, too
     assert all((one != other).any() for one, other in pairwise(frames))
+    left, right = np.split(frames[-3:, 30:, 12:].astype(int), 2, axis=2)
+    assert not np.ptp(left[..., :280, :], axis=0).any()  # the shorter episode stands still
+    assert np.ptp(right, axis=0).any()
 
 
 def test_learning_curve_is_mean_over_tasks_and_std_over_seeds():
@@ -239,19 +212,20 @@ def test_learning_curve_is_mean_over_tasks_and_std_over_seeds():
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("episodes", "return of the optimized prompt")
 
 
-def test_training_curve_shows_what_was_logged(tmp_path):
+def test_no_line_of_an_unknown_optimum():
+    unknown = replace(fake_results(), optimal_returns=np.full(2, np.nan))
+    (ax,) = figures.learning_curve({"ucb": unknown}).axes
+    assert [line.get_label() for line in ax.lines] == ["MGPO-UCB"]
+
+
+def test_training_curve_shows_what_was_logged():
     rows = [
         {"step": 10, "train/loss": 1.5, "val/loss": 1.6, "eval/initial_return": -6.0},
         {"step": 20, "train/loss": 1.0, "val/loss": 1.2, "eval/initial_return": -4.0},
     ]
-    path = tmp_path / "metrics.jsonl"
-    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
-    losses, returns = figures.training_curve(path).axes
+    losses, returns = figures.training_curve(rows).axes
     curves = [line.get_xydata().tolist() for line in (*losses.lines, *returns.lines)]
     assert curves == [[[10, 1.5], [20, 1.0]], [[10, 1.6], [20, 1.2]], [[10, -6], [20, -4]]]
-    path.write_text("{")
-    with pytest.raises(DataError, match=r"metrics\.jsonl is missing or not readable"):
-        figures.training_curve(path)
 
 
 def test_repeated_and_unknown_methods_get_colors_of_their_own():
@@ -264,8 +238,9 @@ def test_repeated_and_unknown_methods_get_colors_of_their_own():
 
 def test_final_prompts_of_all_methods_share_a_maze():
     results = {"ucb": fake_results(), "bbt": fake_results("bbt")}
-    results["bbt"].best_goals[:, :, -1, -2] = [9.0, 9.0]
-    figure = maze.prompts_on_mazes(results, results["ucb"].tasks, which=(0, 1))
+    beyond = np.array([[9.0, 9.0], *results["bbt"].best_goals(0, 0)[1:]])
+    results["bbt"].found = [{1: beyond}, {1: beyond}]
+    figure = rollouts.prompts(PICTURES, results, which=(0, 1))
     assert len(figure.axes) == 2
     discs = discs_of(figure.axes[0])
     assert [disc[:3] for disc in discs[:1]] == [("1", 3, 3)]
@@ -276,16 +251,30 @@ def test_final_prompts_of_all_methods_share_a_maze():
 
 
 def test_visits_are_counted_per_episode(key):
-    task = maze.task_at(fake_results().tasks, 0)
-    prompt = fake_results().best_prompt(0, 0)
-    counts = maze.visit_counts(base.run_policy(key, ENV, NORTHWARD, task, prompt), MAZE)
+    task = fake_results().task(0)
+    played = PLAY(key, task, fake_results().best_goals(0, 0), 4, False)
     expected = np.zeros((SIDE, SIDE))
     expected[5:0:-1, 3] = [1, 1, 1, 1, 3]  # four steps up, the last two against the wall
-    np.testing.assert_allclose(counts, expected)
+    np.testing.assert_allclose(maze.visit_counts(played, MAZE, START), expected)
+
+
+def test_visits_and_walks_end_with_their_episodes():
+    goals = np.array([[[4, 3], [3, 3]], [[4, 3], [0, 0]]]) / SIDE
+    trajectory = Trajectory(goals, None, goals, None, goals, np.array([2, 1]))
+    played = Episode(trajectory, None, np.zeros(2), None)
+    counts = maze.visit_counts(played, MAZE, START)
+    assert {tuple(cell): counts[tuple(cell)] for cell in np.argwhere(counts)} == {
+        (3, 3): 0.5,
+        (4, 3): 1.0,
+        START: 1.0,
+    }
+    short = played._replace(trajectory=jax.tree.map(lambda leaf: leaf[1], trajectory))
+    np.testing.assert_array_equal(maze.walk_of(short, SIDE, START), [START, (4, 3)])
 
 
 def test_evolution_shows_the_stages_there_are(key):
-    figure = maze.evolution(ENV, NORTHWARD, fake_results(), 0, stages=(1, 10, 40), key=key)
+    results = fake_results()
+    figure = rollouts.evolution(PICTURES, results, PLAY, 0, 0, key, stages=(1, 10, 40))
     mazes = [ax for ax in figure.axes if ax.images]
     # 6 steps at -0.1; episode 40 lies beyond the 20 of the results.
     assert [ax.get_title() for ax in mazes] == [
@@ -293,10 +282,12 @@ def test_evolution_shows_the_stages_there_are(key):
         "10 episodes  (return \N{MINUS SIGN}0.60)",
     ]
     assert [[disc[:3] for disc in discs_of(ax)] for ax in mazes] == [[], [("1", 3, 3)]]
+    (bar,) = [ax for ax in figure.axes if not ax.images]
+    assert bar.get_ylabel() == "visits in an episode"
 
 
 def test_short_prompts_stand_above_long_ones(key):
-    figure = maze.short_and_long(ENV, NORTHWARD, fake_results().tasks, key)
+    figure = rollouts.short_and_long(PICTURES, fake_results(), PLAY, (0, 1), key)
     mazes = [ax for ax in figure.axes if ax.images]
     assert [ax.get_title().split("  ")[0] for ax in mazes] == ["1 goal"] * 2 + ["3 goals"] * 2
     for above, below in zip(mazes[:2], mazes[2:], strict=True):
@@ -306,119 +297,72 @@ def test_short_prompts_stand_above_long_ones(key):
         assert all(abs(disc[2] - 3) < 1.5 for disc in discs_of(below))
 
 
-def test_results_survive_the_disk(tmp_path):
-    results = fake_results()
-    loaded = results_module.load_results(save_results(tmp_path / "run", results))
-    jax.tree.map(
-        np.testing.assert_array_equal, loaded._replace(config={}), results._replace(config={})
-    )
-    assert loaded.config == results.config
+def write_all(folder, drawn):
+    """Write figures into a folder; returns their names."""
+    names = []
+    for name, save in drawn:
+        save(folder / name)
+        names.append(name)
+    return names
 
 
-def rewrite(name, **changes):
-    def damage(folder):
-        with np.load(folder / name) as file:
-            arrays = dict(file)
-        for key, value in changes.items():
-            arrays.pop(key, None)
-            if value is not None:
-                arrays[key] = value
-        np.savez(folder / name, **arrays)
-
-    return damage
-
-
-def overwrite(name, content):
-    return lambda folder: (folder / name).write_bytes(content)
-
-
-def truncate(folder):
-    path = folder / "results.npz"
-    path.write_bytes(path.read_bytes()[:-200])
-
-
-DAMAGES = {
-    "no arrays": (lambda folder: (folder / "results.npz").unlink(), r"results\.npz is missing"),
-    "no tasks": (lambda folder: (folder / "tasks.npz").unlink(), r"tasks\.npz is missing"),
-    "no config": (lambda folder: (folder / "config.json").unlink(), r"config\.json is missing"),
-    "cut": (truncate, r"results\.npz is not a readable npz"),
-    "empty": (overwrite("tasks.npz", b""), r"tasks\.npz is not a readable npz"),
-    "no JSON": (overwrite("summary.json", b"{"), r"summary\.json is not readable JSON"),
-    "no text": (overwrite("config.json", b"\xff\xfe"), r"config\.json is not readable JSON"),
-    "a list": (overwrite("config.json", b"[]"), r"config\.json does not hold a JSON object"),
-    "no method": (overwrite("config.json", b'{"env": "tiny"}'), "does not name the bandit"),
-    "lacks": (rewrite("results.npz", best_goals=None), "lacks best_goals"),
-    "axes": (
-        rewrite("results.npz", best_masks=np.ones((2, 2, 20, 4), bool)),
-        r"best_masks has shape \[2, 2, 20, 4\], which does not fit the axes SNEP \(.*P 3",
-    ),
-    "rank": (rewrite("results.npz", optimal_returns=np.float32(1)), "optimal_returns has shape"),
-    "NaN": (rewrite("results.npz", eval_returns=np.full((2, 2, 2), np.nan)), "eval_returns holds"),
-    "other tasks": (rewrite("tasks.npz", goal=np.zeros((3, 2))), r"goal has shape \[3, 2\].* 2 t"),
-}
-
-
-@pytest.mark.parametrize("name", DAMAGES)
-def test_broken_results_are_named(tmp_path, name):
-    damage, message = DAMAGES[name]
-    folder = save_results(tmp_path / "run", fake_results())
-    damage(folder)
-    with pytest.raises(DataError, match=message):
-        results_module.load_results(folder)
-
-
-def test_a_folder_that_is_not_there(tmp_path):
-    with pytest.raises(DataError, match="no result folder"):
-        results_module.load_results(tmp_path / "nowhere")
-
-
-@pytest.fixture
-def no_checkpoint(monkeypatch):
-    """The command with a policy made by hand."""
-    monkeypatch.setattr(plot, "_load", lambda result: NORTHWARD)
-
-
-def test_command_draws_everything(tmp_path, no_checkpoint):
-    runs = tuple(
-        save_results(tmp_path / name, fake_results(bandit))
-        for name, bandit in (("a", "ucb"), ("b", "bbt"))
-    )
-    plot.main(plot.PlotConfig(runs=runs, out=tmp_path / "out", tasks=(1,)))
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {
-        "tiny_learning_curve.png",
-        "tiny_prompts.png",
-        "tiny_short_and_long.png",
-        *(f"tiny_{bandit}_evolution_task1.png" for bandit in ("ucb", "bbt")),
-        *(f"tiny_{bandit}_episode_task1.gif" for bandit in ("ucb", "bbt")),
+def test_everything_that_a_world_draws(tmp_path):
+    results = {"ucb": fake_results(), "ucb (again)": fake_results(), "bbt": fake_results("bbt")}
+    drawn = figures.figures_of_results(PICTURES, results, lambda result: PLAY, (1,), 0)
+    methods = ("ucb", "ucb_1", "bbt")
+    assert set(write_all(tmp_path, drawn)) == {
+        "prompts.png",
+        "short_and_long.png",
+        *(f"{method}_evolution_task1.png" for method in methods),
+        *(f"{method}_episode_task1.gif" for method in methods),
     }
-    picture = iio.imread(tmp_path / "out" / "tiny_prompts.png")
+    picture = iio.imread(tmp_path / "prompts.png")
     assert min(picture.shape[:2]) > 100
     assert np.ptp(picture) > 0
 
 
-def test_an_adaptation_draws_into_its_own_folder(tmp_path):
-    folder = save_results(tmp_path / "run", fake_results())
-    plot.draw_run(folder)
-    assert {path.name for path in folder.glob("*.png")} == {"learning_curve.png", "prompts.png"}
+def test_what_is_drawn_right_after_an_adaptation(tmp_path):
+    drawn = figures.figures_of_run(PICTURES, fake_results(), (0, 1))
+    assert write_all(tmp_path, drawn) == ["prompts.png"]
 
 
-def test_worlds_without_pictures_get_curves_only(tmp_path, monkeypatch):
-    monkeypatch.setitem(envs.ENVIRONMENTS, "tiny", Plain)
-    results = fake_results()._replace(tasks={"order": np.zeros((2, 4))})
-    run = save_results(tmp_path / "run", results)
-    plot.main(plot.PlotConfig(runs=(run,), out=tmp_path / "out"))
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["tiny_learning_curve.png"]
+def refuse(result):
+    raise AssertionError("no policy is needed")
 
 
-def test_command_refuses_what_it_cannot_draw(tmp_path, no_checkpoint):
-    run = save_results(tmp_path / "run", fake_results())
-    other = fake_results()._replace(tasks={"maze": np.stack([MAZE.T] * 2), "goal": np.ones((2, 2))})
-    elsewhere = save_results(tmp_path / "other", other)
-    for config, message in (
-        (plot.PlotConfig(), "no result folder given"),
-        (plot.PlotConfig(runs=(run, elsewhere)), "different tasks"),
-        (plot.PlotConfig(runs=(run,), seed=2), "--seed 2: .* has 2 seeds"),
-        (plot.PlotConfig(runs=(run,), tasks=(7,)), "tasks 0 to 1"),
-    ):
-        with pytest.raises(UsageError, match=message):
-            plot.main(replace(config, out=tmp_path / "out"))
+@pytest.mark.parametrize("offered", [Pictures(), PICTURES])
+def test_nothing_of_worlds_without_pictures_and_methods_without_prompts(offered):
+    result = fake_results() if offered == Pictures() else replace(fake_results(), found=None)
+    assert not list(figures.figures_of_run(offered, result, (0,)))
+    assert not list(figures.figures_of_results(offered, {"a": result}, refuse, (0,), 0))
+
+
+def test_methods_without_prompts_stand_aside(tmp_path):
+    results = {"gcbc": replace(fake_results("gcbc"), found=None), "ucb": fake_results()}
+    only_prompts = Pictures(prompts=PICTURES.prompts)
+    drawn = figures.figures_of_results(only_prompts, results, refuse, (0,), 0)
+    assert write_all(tmp_path, drawn) == ["prompts.png"]
+
+
+def test_a_world_that_draws_only_frames_gets_videos(tmp_path):
+    def frame(obs):
+        """The cell of the agent in white, on gray ground of 2 pixels a cell."""
+        picture = np.full((SIDE, SIDE, 3), 100, np.uint8)
+        picture[tuple(np.rint(obs[:2] * SIDE).astype(int))] = 255
+        return picture.repeat(2, axis=0).repeat(2, axis=1)
+
+    drawn = figures.figures_of_results(
+        Pictures(frame=frame), {"ucb": fake_results()}, lambda result: PLAY, (0, 1), 0
+    )
+    assert write_all(tmp_path, drawn) == ["ucb_episode_task0.gif"]
+    video = iio.imread(tmp_path / "ucb_episode_task0.gif").astype(int)
+    # The start and four steps to the north; the two steps against the wall show in the caption.
+    assert len(video) == ENV.horizon + 1
+    height = video.shape[1]
+    assert height > 200
+    for half in np.split(video, 2, axis=2):
+        # Below the title and above the caption.
+        rows = [np.argwhere((image[40:-40, 5:-5] > 200).all(axis=-1))[:, 0] for image in half]
+        means = [row.mean() for row in rows]
+        assert np.all(np.diff(means[:5]) < -10)
+        assert np.ptp(means[4:]) < 1

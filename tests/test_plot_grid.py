@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+from dataclasses import replace
 from itertools import pairwise
 
 import imageio.v3 as iio
@@ -10,26 +10,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fakes import FakeResults, player
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyBboxPatch
 
 import envs
-from envs.experts.grid import switcher
-from envs.grid_world import FLIP, NONE, NUM_OBJECTS, OBJECTS, SOUTH, GridTask
-from envs.render import draw_grid, draw_objects, grid_gif
-from envs.render.grid import LETTERS, OBJECT_COLORS, Walk, objects_of
-from envs.render.palette import PAPER
-from experiments import plot
-from experiments import results as results_module
-from experiments.figures import grid, maze, pictures
+from envs.drawing.palette import PAPER
+from envs.episodes import run_episode
+from envs.gridworld import pictures as grid
+from envs.gridworld.demonstrators import switcher
+from envs.gridworld.env import FLIP, NONE, NUM_OBJECTS, OBJECTS, SOUTH, GridTask
+from envs.gridworld.pictures import LETTERS, OBJECT_COLORS, Walk, objects_of
+from experiments import figures
+from experiments.figures import rollouts
 from mgpo_jax.distributions import Categorical
 from mgpo_jax.policy import Policy
-from mgpo_jax.prompts import single_goal
-from mgpo_jax.rollout import run_episode
-from mgpo_jax.types import Prompt
 
 ENV = envs.make("gridworld")
+PICTURES = grid.grid_pictures(ENV)
 SLOTS = NUM_OBJECTS + 1
 ORDERS = np.array([[2, 0, 5, NONE, NONE, NONE, NONE], [6, 5, 4, 3, 2, 1, 0]], np.int32)
 # Found after some episodes, as letters of goals before g^M: on the first task and on the second.
@@ -41,38 +40,28 @@ def objects(letters: str) -> np.ndarray:
     return np.array([LETTERS.index(letter) for letter in letters], int)
 
 
-def prompt_of(letters: str, order: np.ndarray) -> Prompt:
+def prompt_of(letters: str, order: np.ndarray) -> np.ndarray:
     """Goals by their letters, then g^M."""
-    rows = np.zeros((SLOTS, NUM_OBJECTS), np.float32)
-    for slot, thing in enumerate(objects(letters), start=SLOTS - 1 - len(letters)):
-        rows[slot, thing] = 1
-    rows[-1, objects_of(order)] = 1
-    return Prompt(jnp.asarray(rows), jnp.arange(SLOTS) >= SLOTS - 1 - len(letters))
+    goals = np.eye(NUM_OBJECTS, dtype=np.float32)
+    return np.concatenate([goals[objects(letters)], goals[objects_of(order)].sum(axis=0)[None]])
 
 
-def fake_results(bandit: str = "ucb") -> results_module.Results:
+def fake_results(method: str = "ucb") -> FakeResults:
     """1 seed, the 2 tasks of ``ORDERS``, 40 episodes; the best prompts are those of ``FOUND``."""
-    num = 40
-    goals = np.zeros((1, 2, num, SLOTS, NUM_OBJECTS), np.float32)
-    masks = np.zeros((1, 2, num, SLOTS), bool)
-    for since, letters in FOUND.items():
-        for task, order in enumerate(ORDERS):
-            prompt = prompt_of(letters[task], order)
-            goals[0, task, since - 1 :], masks[0, task, since - 1 :] = prompt
-    returns = np.zeros((1, 2, num), np.float32)
-    return results_module.Results(
-        returns=returns,
-        greedy=returns == 0,
-        prompt_goals=goals,
-        prompt_masks=masks,
-        best_goals=goals,
-        best_masks=masks,
+    found = [
+        {since: prompt_of(letters[task], order) for since, letters in FOUND.items()}
+        for task, order in enumerate(ORDERS)
+    ]
+    return FakeResults(
+        tasks=[GridTask(order) for order in ORDERS],
+        task_goals=np.stack([prompts[1][-1] for prompts in found]),
+        found=found,
         eval_episodes=EVALUATED,
-        eval_returns=np.array([[[0.0, 0.33, 0.67, 1.0], [0.14, 0.29, 0.14, 1.0]]], np.float32),
-        optimal_returns=np.ones(2, np.float32),
-        tasks={"order": ORDERS},
-        config={"env": "gridworld", "bandit": bandit, "policy": None},
-        summary={},
+        eval_returns=np.array([[[0.0, 0.33, 0.67, 1.0], [0.14, 0.29, 0.14, 1.0]]]),
+        optimal_returns=np.ones(2),
+        num_episodes=40,
+        max_goals=SLOTS,
+        method=method,
     )
 
 
@@ -112,7 +101,7 @@ def labeled(ax):
 
 def on_grid(order, **options):
     ax = Figure().add_subplot()
-    draw_grid(ax, order, np.ones(NUM_OBJECTS, bool), **options)
+    grid.draw_grid(ax, order, np.ones(NUM_OBJECTS, bool), **options)
     return ax
 
 
@@ -146,25 +135,23 @@ def test_goals_that_name_no_object_do_not_agree():
 def test_the_task_goal_at_the_end_is_not_named():
     order = ORDERS[0]
     np.testing.assert_array_equal(grid.named_objects(prompt_of("CF", order), order), objects("CF"))
-    assert len(grid.named_objects(single_goal(prompt_of("", order).goals[-1], SLOTS), order)) == 0
+    assert len(grid.named_objects(prompt_of("", order), order)) == 0
     # One that names another set is.
     np.testing.assert_array_equal(grid.named_objects(prompt_of("C", ORDERS[1]), order), [2, NONE])
 
 
 def test_moved_goals_count_as_what_they_are_nearest_to():
-    order, prompt = ORDERS[0], prompt_of("CF", ORDERS[0])
-    moved = prompt.goals + 0.3 * jnp.sign(jnp.sin(jnp.arange(prompt.goals.size))).reshape(SLOTS, -1)
-    np.testing.assert_array_equal(
-        grid.named_objects(prompt._replace(goals=moved), order), objects("CF")
-    )
-    lost = prompt.goals.at[-2].set(0.1)
-    np.testing.assert_array_equal(grid.named_objects(prompt._replace(goals=lost), order), [2, NONE])
+    order, goals = ORDERS[0], prompt_of("CF", ORDERS[0])
+    moved = goals + 0.3 * np.sign(np.sin(np.arange(goals.size))).reshape(goals.shape)
+    np.testing.assert_array_equal(grid.named_objects(moved, order), objects("CF"))
+    moved[-2] = 0.1
+    np.testing.assert_array_equal(grid.named_objects(moved, order), [2, NONE])
 
 
 def test_objects_have_colors_of_their_own():
     assert len({*OBJECT_COLORS}) == len(LETTERS) == NUM_OBJECTS
     ax = Figure().add_subplot()
-    draw_objects(ax, np.array([0, 6, NONE]), np.array([True, False, False]), 2.0, x=1.0)
+    grid.draw_objects(ax, np.array([0, 6, NONE]), np.array([True, False, False]), 2.0, x=1.0)
     assert labeled(ax) == [("A", 1, 2, True), ("G", 2, 2, False), ("?", 3, 2, False)]
 
 
@@ -223,8 +210,8 @@ def test_walks_include_the_last_step(key):
     np.testing.assert_array_equal(np.flatnonzero(walk.is_on[-1]), sorted(objects_of(ORDERS[0])))
 
 
-def test_orders_show_each_stage_with_its_return():
-    figure = grid.orders(fake_results(), (1, 0))
+def test_a_search_shows_each_stage_with_its_return():
+    figure = rollouts.search(PICTURES, fake_results(), (1, 0))
     second, first = figure.axes
     rows = {}
     for label, _, row, filled in labeled(first):
@@ -237,16 +224,16 @@ def test_orders_show_each_stage_with_its_return():
     ]  # fmt: skip
 
 
-def test_orders_draw_evaluated_stages_and_the_last():
-    results = fake_results()._replace(eval_episodes=np.array([1, 1, 15, 30]))
-    (ax,) = grid.orders(results, (0,)).axes
+def test_a_search_shows_evaluated_stages_and_the_last():
+    results = replace(fake_results(), eval_episodes=np.array([1, 1, 15, 30]))
+    (ax,) = rollouts.search(PICTURES, results, (0,)).axes
     labels = [tick.get_text() for tick in ax.get_yticklabels()]
     assert labels == ["true order", "1 episode", "30 episodes"]
 
 
 def test_no_text_hides_another(tmp_path):
-    figure = grid.orders(fake_results(), (0, 1))
-    figure.savefig(tmp_path / "orders.png")
+    figure = rollouts.search(PICTURES, fake_results(), (0, 1))
+    figure.savefig(tmp_path / "search.png")
     for ax in figure.axes:
         boxes = [text.get_window_extent() for text in (*ax.texts, *ax.get_yticklabels())]
         boxes += [patch.get_window_extent() for patch in ax.patches if isinstance(patch, Circle)]
@@ -258,45 +245,29 @@ def test_gif_shows_every_step(tmp_path):
     is_on = np.zeros((4, NUM_OBJECTS), bool)
     is_on[3, 5] = True
     walk = Walk(np.array([[5, 0], [5, 1], [6, 1], [6, 1]]), is_on)
-    grid_gif(tmp_path / "walk.gif", ORDERS[0], walk, objects("CAF"))
+    shorter = Walk(walk.positions[:2], is_on[:2])
+    panels = [grid.Panel("long", walk, objects("CAF")), grid.Panel("short", shorter)]
+    grid.grid_gif(tmp_path / "walk.gif", ORDERS[0], panels)
     frames = iio.imread(tmp_path / "walk.gif")
     assert len(frames) == 4
     assert all((one != other).any() for one, other in pairwise(frames))
+    right = frames[1:, :, frames.shape[2] // 2 + 10 :]
+    assert not np.ptp(right.astype(int), axis=0).any()  # the shorter episode stands still
 
 
-def save_results(folder, results):
-    folder.mkdir(parents=True)
-    arrays = {name: getattr(results, name) for name in results_module.AXES}
-    np.savez(folder / "results.npz", **arrays)
-    np.savez(folder / "tasks.npz", **results.tasks)
-    (folder / "config.json").write_text(json.dumps(results.config))
-    (folder / "summary.json").write_text("{}")
-    return folder
+def test_a_search_is_drawn_right_after_an_adaptation(tmp_path):
+    ((name, save),) = figures.figures_of_run(PICTURES, fake_results(), (0, 1))
+    save(tmp_path / name)
+    assert name == "search.png"
 
 
-def test_an_adaptation_draws_its_orders(tmp_path):
-    folder = save_results(tmp_path / "run", fake_results())
-    plot.draw_run(folder)
-    assert {path.name for path in folder.glob("*.png")} == {"learning_curve.png", "orders.png"}
-
-
-def test_command_draws_everything(tmp_path, monkeypatch):
-    monkeypatch.setattr(plot, "_load", lambda result: flipping_policy())
-    run = save_results(tmp_path / "run", fake_results())
-    plot.main(plot.PlotConfig(runs=(run,), out=tmp_path / "out", tasks=(1, 0)))
-    drawn = {path.name: path for path in (tmp_path / "out").iterdir()}
-    assert set(drawn) == {
-        "gridworld_learning_curve.png",
-        "gridworld_ucb_orders.png",
-        "gridworld_ucb_episodes.png",
-        "gridworld_ucb_episode_task1.gif",
-    }
-    for path in drawn.values():
-        picture = iio.imread(path)
+def test_everything_that_gridworld_draws(tmp_path):
+    play = player(replace(ENV, horizon=12), flipping_policy())
+    results, drawn = {"ucb": fake_results()}, {}
+    for name, save in figures.figures_of_results(PICTURES, results, lambda _: play, (1, 0), 0):
+        save(tmp_path / name)
+        drawn[name] = iio.imread(tmp_path / name)
+    assert set(drawn) == {"ucb_search.png", "ucb_episodes.png", "ucb_episode_task1.gif"}
+    for picture in drawn.values():
         assert min(picture.shape[-3:-1]) > 100
         assert np.ptp(picture) > 0
-
-
-def test_worlds_choose_their_pictures_by_type():
-    assert pictures(ENV).draw_run is grid.draw_run
-    assert pictures(envs.make("maze15")).draw_run is maze.draw_run

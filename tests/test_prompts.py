@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from envs.base import Trajectory
 from mgpo_jax.prompts import hindsight_outcome, sample_prompt, single_goal, until_reached
-from mgpo_jax.types import Trajectory
 
 NUM_STEPS = 9
 NUM_SLOTS = 4
@@ -31,7 +31,7 @@ def make_trajectory(reached, length, ends_at_goal=False):
     return Trajectory(
         obs=jnp.zeros((num_steps, 3)),
         actions=jnp.zeros(num_steps, jnp.int32),
-        goals=jnp.asarray(goals),
+        achieved_goals=jnp.asarray(goals),
         goal_reached=jnp.asarray(reached),
         outcomes=jnp.asarray(outcomes),
         length=jnp.int32(length),
@@ -209,7 +209,7 @@ def test_a_trajectory_ends_where_it_reaches_the_goal():
     trajectory = make_trajectory([True] * NUM_STEPS, length=7)
     for step, length in ((0, 1), (3, 4), (6, 7), (7, 7)):  # step 7 is padding
         goal = jnp.array([step + 1.5, step + 100.5])
-        assert int(until_reached(trajectory, goal).length) == length
-    cut = until_reached(trajectory, jnp.array([4.5, 103.5]))
+        assert int(until_reached(trajectory.goals, goal).length) == length
+    cut = until_reached(trajectory.goals, jnp.array([4.5, 103.5]))
     drawn = draw_many(0, cut, NUM_SLOTS)
     assert np.nanmax(np.where(drawn.mask[:, :-1], drawn.goals[:, :-1, 0], np.nan)) == 4

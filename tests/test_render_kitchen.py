@@ -12,17 +12,17 @@ import pytest
 from conftest import require_kitchen
 
 from envs.kitchen import NoOpenGLError
-from envs.kitchen.world import POSITIONS
-from envs.render.kitchen import kitchen_frames
+from envs.kitchen.env import POSITIONS
+from envs.kitchen.pictures import kitchen_frames
 
 require_kitchen()
 import mujoco  # noqa: E402
 
 DRAW = """
 import sys, numpy as np
-from envs.render.kitchen import Panel, kitchen_gif
+from envs.kitchen.pictures import Panel, kitchen_gif
 from envs.kitchen.model import INITIAL_POSITIONS
-from envs.kitchen.world import POSITIONS
+from envs.kitchen.env import POSITIONS
 obs = np.zeros((3, 59))
 obs[:, POSITIONS] = INITIAL_POSITIONS
 obs[2, 31] = -1.5  # microwave

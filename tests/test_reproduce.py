@@ -10,13 +10,15 @@ from typing import Any
 import jax
 import pytest
 
-import mgpo_jax.rollout
-from experiments import reproduce
-from experiments.configs import PretrainConfig, pretrain_preset
-from experiments.reproduce import ReproduceConfig, main
-from experiments.results import load_results
-from experiments.tasks import benchmark_tasks
-from mgpo_jax.errors import DataError, UsageError
+import envs
+from envs import episodes
+from envs.errors import DataError, UsageError
+from experiments import ablations
+from experiments.reproduce import main
+from experiments.store.results import load_results
+from experiments.store.settings import PretrainConfig, ReproduceConfig, pretrain_preset
+from mgpo_jax.settings import check_settings
+from mgpo_jax.tasks import test_tasks as released_tasks
 
 
 def tiny_preset(env: str, preset: str) -> PretrainConfig:
@@ -33,16 +35,16 @@ def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Trainings of two steps and adaptations of two episodes to two tasks."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("MGPO_DATA", raising=False)
-    monkeypatch.setattr(reproduce, "pretrain_preset", tiny_preset)
-    monkeypatch.setattr(reproduce, "EPISODES", 2)
-    monkeypatch.setattr(mgpo_jax.rollout, "NUM_SEGMENTS", 1)
-    few = lambda env: jax.tree.map(lambda leaf: leaf[:2], benchmark_tasks(env))  # noqa: E731
-    monkeypatch.setattr(reproduce, "benchmark_tasks", few)
+    monkeypatch.setattr(ablations, "pretrain_preset", tiny_preset)
+    monkeypatch.setattr(ablations, "EPISODES", 2)
+    monkeypatch.setattr(episodes, "MAX_SEGMENTS", 1)
+    few = lambda world: jax.tree.map(lambda leaf: leaf[:2], released_tasks(world))  # noqa: E731
+    monkeypatch.setattr(ablations, "test_tasks", few)
     return tmp_path
 
 
 def test_table5_from_data_to_table(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = ReproduceConfig(what="table5", only=("astar2",), steps=2, episodes=24, seeds=1)
+    config = ReproduceConfig(what="table5", only=("astar2",), steps=2, trajectories=24, seeds=1)
     main(config)
     folder = tiny / "runs" / "reproduce" / "maze15"
     text = (folder / "table5.md").read_text()
@@ -60,8 +62,8 @@ def test_table5_from_data_to_table(tiny: Path, monkeypatch: pytest.MonkeyPatch) 
     def never(*args: Any, **options: Any) -> None:
         raise AssertionError("what is finished was done again")
 
-    monkeypatch.setattr(reproduce, "pretrain", never)
-    monkeypatch.setattr(reproduce, "run_variants", never)
+    monkeypatch.setattr(ablations, "train", never)
+    monkeypatch.setattr(ablations, "adapt_all", never)
     (folder / "table5.md").unlink()
     main(config)
     assert (folder / "table5.md").read_text() == text
@@ -74,34 +76,34 @@ def test_table5_from_data_to_table(tiny: Path, monkeypatch: pytest.MonkeyPatch) 
 
 def test_a_stopped_training_goes_on(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[PretrainConfig] = []
-    monkeypatch.setattr(reproduce, "pretrain", asked.append)
+    monkeypatch.setattr(ablations, "train", asked.append)
     config = ReproduceConfig(what="figure8", steps=2)
-    policy = reproduce.trained(config, "astar4", "astar4", max_prompt_length=10)
+    policy = ablations.trained(config, "astar4", "astar4", max_prompt_length=10)
     policy.parent.mkdir(parents=True)
-    reproduce.trained(config, "astar4", "astar4", max_prompt_length=10)
+    ablations.trained(config, "astar4", "astar4", max_prompt_length=10)
     assert [one.resume for one in asked] == [False, True]
     for one in asked:
         assert (one.out, one.max_prompt_length) == (policy.parent, 10)
         assert (one.data.demonstrator, one.train.steps) == ("astar4", 2)
     policy.mkdir()
-    reproduce.trained(config, "astar4", "astar4", max_prompt_length=10)
+    ablations.trained(config, "astar4", "astar4", max_prompt_length=10)
     assert len(asked) == 2
 
 
 def test_heads_differ_in_nothing_else(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[PretrainConfig] = []
     adapted: list[Path] = []
-    monkeypatch.setattr(reproduce, "pretrain", asked.append)
+    monkeypatch.setattr(ablations, "train", asked.append)
     monkeypatch.setattr(
-        reproduce, "adapted", lambda config, policy, folders: adapted.extend(folders)
+        ablations, "adapted", lambda config, policy, folders: adapted.extend(folders)
     )
-    lines = reproduce.heads(ReproduceConfig(what="heads", env="kitchen", steps=2))
+    lines = ablations.heads(ReproduceConfig(what="heads", env="kitchen", steps=2))
     assert [line.label for line in lines] == ["gaussian", "fixed_gaussian", "mixture", "binned"]
     assert [line.results for line in lines] == adapted
     assert [one.head for one in asked] == [line.label for line in lines]
     same = {replace(one, head=None, out=None) for one in asked}
     assert len(same) == 1
-    assert same.pop().data.episodes == 9_000
+    assert same.pop().data.trajectories == 9_000
 
 
 @pytest.mark.parametrize(
@@ -109,12 +111,54 @@ def test_heads_differ_in_nothing_else(tiny: Path, monkeypatch: pytest.MonkeyPatc
     [
         (ReproduceConfig(what="tabel5"), "did you mean 'table5'"),
         (ReproduceConfig(what="table5", env="gridworld"), "no table5 for gridworld"),
-        (ReproduceConfig(what="heads"), "no heads for maze15; choose --env kitchen"),
+        (
+            ReproduceConfig(what="heads"),
+            "no heads for maze15: it compares distributions of continuous",
+        ),
         (ReproduceConfig(what="table5", only=("astar3",)), "did you mean 'astar"),
         (ReproduceConfig(what="figure8", only=("41",)), "row of figure8"),
         (ReproduceConfig(what="table4", steps=0), "--steps must be at least 1"),
     ],
 )
-def test_usage_errors(config: ReproduceConfig, says: str) -> None:
-    with pytest.raises(UsageError, match=says):
+def test_usage_errors(
+    config: ReproduceConfig, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    def call() -> None:
+        check_settings(config)
         main(config)
+
+    with pytest.raises(UsageError, match=says):
+        call()
+    assert not config.folder.exists()
+
+
+def test_budgets_are_those_of_the_worlds_preset() -> None:
+    sizes = {"maze15": (2_000, 10_000), "maze30": (1_000, 10_000), "kitchen": (1_000, 9_000)}
+    for env, size in sizes.items():
+        config = ReproduceConfig(what="table4", env=env)
+        assert (config.num_steps, config.num_trajectories) == size
+    config = ReproduceConfig(what="table4", env="gridworld")  # has none: those of its recipe
+    assert (config.num_steps, config.num_trajectories) == (3_000, 68_000)
+    assert "ablation" not in envs.find("gridworld").presets
+
+
+def test_table4_varies_length_and_constant(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: dict[Path, Any] = {}
+
+    def adapted(config: ReproduceConfig, policy: Path | None, folders: dict[Path, Any]) -> None:
+        assert policy is None
+        asked.update(folders)
+
+    monkeypatch.setattr(ablations, "adapted", adapted)
+    lines = ablations.table4(ReproduceConfig(what="table4"))
+    assert [line.label for line in lines] == [
+        "K = 1", "K = 2", "K = 3", "K = 5", "c = 0", "c = 1", "c = 10",
+    ]  # fmt: skip
+    hypers = [asked[line.results] for line in lines]
+    assert [hyper.max_goals for hyper in hypers] == [1, 2, 3, 5, 5, 5, 5]
+    assert [hyper.c for hyper in hypers[4:]] == [0, 1, 10]
+    assert all(hyper.scale == 1 for hyper in hypers[4:])  # Eq. 3 as printed
+    assert all(hyper.scale is None for hyper in hypers[:4])
+    assert (lines[0].paper, lines[3].paper) == ("-2.63 ± 0.00", "-0.41 ± 0.10")

@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-import mgpo_jax.rollout
+import envs.episodes
 from envs.base import Agent
-from envs.maze_runner import EAST, NORTH, STAY, WEST, MazeRunner, MazeTask
-from envs.wrapper import Wrapper
+from envs.episodes import run_episode
+from envs.maze.env import EAST, NORTH, STAY, WEST, MazeRunner, MazeTask
+from envs.wrappers import Wrapper
 from mgpo_jax.policy import transformer_policy
-from mgpo_jax.rollout import prompted, rollout, run_episode
+from mgpo_jax.prompts import Prompt
+from mgpo_jax.rollout import Query, prompted, rollout
 from mgpo_jax.transformer import GoalTransformer, TransformerConfig
-from mgpo_jax.types import Prompt, Query
 
 ENV = MazeRunner(name="tiny", side=7, horizon=12)
 DRAWING = """
@@ -31,7 +32,7 @@ DRAWING = """
 """
 MAZE = jnp.array([[cell == "#" for cell in row] for row in DRAWING.split()], jnp.int32)
 CONFIG = TransformerConfig(
-    obs_dim=6, goal_dim=2, action_dim=5, horizon=12, max_prompt_length=3,
+    obs_shape=(6,), goal_dim=2, action_dim=5, horizon=12, max_prompt_length=3,
     embed_dim=16, num_layers=1, dropout=0.0,
 )  # fmt: skip
 
@@ -67,6 +68,14 @@ def noisy(quit_rate):
     )
 
 
+@pytest.fixture(scope="module", autouse=True)
+def several_segments():
+    """An episode as short as these would run in one segment; borders are to be crossed."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(envs.episodes, "SEGMENT_STEPS", 4)
+        yield
+
+
 @pytest.fixture(scope="module")
 def params():
     network = GoalTransformer(CONFIG)
@@ -99,8 +108,8 @@ def test_a_scripted_episode_is_recorded_exactly():
     np.testing.assert_allclose(episode.rewards, rewards, atol=1e-6)
     np.testing.assert_allclose(trajectory.obs[:6] * 7, seen, atol=1e-5)
     np.testing.assert_array_equal(trajectory.actions[:6], actions)
-    np.testing.assert_allclose(trajectory.goals[:6] * 7, reached, atol=1e-5)
-    np.testing.assert_array_equal(trajectory.outcomes, trajectory.goals)
+    np.testing.assert_allclose(trajectory.achieved_goals[:6] * 7, reached, atol=1e-5)
+    np.testing.assert_array_equal(trajectory.outcomes, trajectory.achieved_goals)
     np.testing.assert_array_equal(trajectory.goal_reached, np.arange(12) < 6)
     for rows in trajectory[:-1]:
         assert rows.shape[0] == 12
@@ -144,9 +153,9 @@ def test_a_world_that_breaks_down_ends_its_episode_alone():
             lambda key, task, state, timestep: act(jnp.int32(0)),
             lambda key, memory, state, timestep: act(memory),
         )
-        return run_episode(jax.random.key(0), Fragile(ENV), agent, task_to(5, 5), "lanes")
+        return run_episode(jax.random.key(0), Fragile(ENV), agent, task_to(5, 5))
 
-    episodes = jax.vmap(play, axis_name="lanes")(jnp.array([EAST, WEST, NORTH]))
+    episodes = jax.vmap(play)(jnp.array([EAST, WEST, NORTH]))
     np.testing.assert_array_equal(episodes.failed, [False, True, False])
     np.testing.assert_array_equal(episodes.trajectory.length, [12, 2, 12])
 
@@ -156,29 +165,20 @@ def test_lanes_equal_single_runs():
     tasks = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[task_to(*cell) for cell in near])
     keys = jax.random.split(jax.random.key(3), len(near))
     single = jax.jit(lambda key, task: run_episode(key, ENV, noisy(0.05), task))
-    lanes = {
-        name: jax.jit(
-            jax.vmap(
-                lambda key, task, name=name: run_episode(key, ENV, noisy(0.05), task, name),
-                axis_name="lane",
-            )
-        )(keys, tasks)
-        for name in ("lane", None)
-    }
+    lanes = jax.jit(jax.vmap(single))(keys, tasks)
     loop = [single(keys[i], jax.tree.map(lambda leaf, i=i: leaf[i], tasks)) for i in range(8)]
-    assert_trees_equal(lanes["lane"], jax.tree.map(lambda *leaves: jnp.stack(leaves), *loop))
-    assert_trees_equal(lanes["lane"], lanes[None])
+    assert_trees_equal(lanes, jax.tree.map(lambda *leaves: jnp.stack(leaves), *loop))
 
-    lengths = np.asarray(lanes["lane"].trajectory.length)
+    lengths = np.asarray(lanes.trajectory.length)
     assert len(set(lengths)) > 3  # the comparison means something
     for lane, length in enumerate(lengths):
-        for rows in lanes["lane"].trajectory[:-1]:
+        for rows in lanes.trajectory[:-1]:
             assert not np.asarray(rows[lane, length:]).any()
 
 
-def test_a_policy_episode_is_what_the_full_pass_says(params, monkeypatch):
+def test_a_policy_episode_is_what_the_full_pass_says(params):
     """Greedy actions are the argmax of the full pass replayed on what was recorded."""
-    monkeypatch.setattr(mgpo_jax.rollout, "NUM_SEGMENTS", 3)  # compiles faster
+    assert envs.episodes.num_segments(CONFIG.horizon) == 3
     prompts = Prompt(
         jax.random.uniform(jax.random.key(1), (4, 3, 2)),
         jnp.array([[False, False, True], [True, True, True], [False, True, True], [True] * 3]),
@@ -190,10 +190,10 @@ def test_a_policy_episode_is_what_the_full_pass_says(params, monkeypatch):
     greedy = jnp.array([True, True, True, False])
 
     @jax.jit
-    @lambda f: jax.vmap(f, axis_name="lane")
+    @jax.vmap
     def run(key, task, prompt, greedy):
         policy = transformer_policy(CONFIG, params)
-        episode = rollout(key, ENV, policy, task, Query(prompt, greedy), "lane")
+        episode = rollout(key, ENV, policy, task, Query(prompt, greedy))
         trajectory = episode.trajectory
         full = GoalTransformer(CONFIG).apply(params, prompt, trajectory.obs, trajectory.actions)
         return trajectory, full.logits

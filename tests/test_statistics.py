@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import trim_mean
 
-from experiments.statistics import interquartile_mean, seed_spread, stratified_bootstrap_iqm
+from experiments.store.statistics import (
+    interquartile_mean,
+    seed_spread,
+    stratified_bootstrap_iqm,
+)
 
 
 @pytest.mark.parametrize("num", [4, 8, 40, 100])

@@ -2,38 +2,130 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import envs
-from experiments.collect import find_demonstrator
-from experiments.pretrain import greedy_evaluation
-from experiments.tasks import benchmark_tasks, evaluation_tasks, num_tasks, task_hashes
-from mgpo_jax.checkpoint import network_config
+from envs.errors import DataError, UsageError
+from envs.wrappers import Wrapper
+from experiments.datasets import find_demonstrator
+from experiments.training import GreedyEvaluation
+from mgpo_jax.policy_files import released_folder
 from mgpo_jax.prompts import single_goal
-from mgpo_jax.transformer import GoalTransformer
+from mgpo_jax.tasks import (
+    benchmark_tasks,
+    evaluation_tasks,
+    load_tasks,
+    num_tasks,
+    sample_tasks,
+    save_tasks,
+    task_at,
+    task_hashes,
+    test_tasks as tasks_to_test,  # pytest would take it for a test
+)
+from mgpo_jax.transformer import GoalTransformer, network_config
+
+NUM = 50
+
+
+def assert_trees_equal(a, b):
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
 @pytest.mark.parametrize("name", ["maze15", "gridworld", "kitchen"])
 def test_evaluation_tasks_are_no_test_tasks(name):
     env = envs.make(name)
-    tasks = evaluation_tasks(env, 64)
+    tasks = evaluation_tasks(env, 64, NUM)
     assert num_tasks(tasks) == 64
-    assert not np.isin(task_hashes(env, tasks), task_hashes(env, benchmark_tasks(env))).any()
+    assert not np.isin(task_hashes(env, tasks), task_hashes(env, benchmark_tasks(env, NUM))).any()
+
+
+@pytest.mark.parametrize("name", ["maze15", "gridworld", "kitchen"])
+def test_test_tasks_are_those_that_were_released(name):
+    """And those that anyone would draw; none is there twice."""
+    world = envs.find(name)
+    env, tasks = world.make(), tasks_to_test(name)
+    assert num_tasks(tasks) == world.num_test_tasks
+    assert_trees_equal(tasks, load_tasks(released_folder(world) / "tasks.npz", env))
+    drawn = benchmark_tasks(env, world.num_test_tasks)
+    assert_trees_equal(tasks, jax.tree.map(np.asarray, drawn))
+    prints = np.unique(
+        np.concatenate(
+            [np.asarray(leaf).reshape(num_tasks(tasks), -1) for leaf in jax.tree.leaves(tasks)],
+            axis=1,
+        ),
+        axis=0,
+    )
+    assert len(prints) == num_tasks(tasks)
+
+
+@dataclass(frozen=True)
+class OfFew(Wrapper):
+    """A world of ``num`` tasks."""
+
+    num: int = 1
+
+    def sample_task(self, key):
+        which = jax.random.randint(key, (), 0, self.num)
+        return self.env.sample_task(jax.random.key(which))
+
+
+def test_worlds_of_few_tasks():
+    few = OfFew(envs.make("gridworld"), 40)
+    tasks = benchmark_tasks(few, 20)
+    assert len(np.unique(task_hashes(few, tasks))) == 20
+    with pytest.raises(DataError, match="gridworld has too few tasks to test on 41 different"):
+        benchmark_tasks(few, 41)
+    others = evaluation_tasks(few, 5, 20)
+    assert not np.isin(task_hashes(few, others), task_hashes(few, tasks)).any()
+    two = OfFew(envs.make("gridworld"), 2)
+    with pytest.raises(DataError, match="gridworld has too few tasks to evaluate on 1 others"):
+        evaluation_tasks(two, 1, 2)
+
+
+@pytest.mark.parametrize("name", ["maze15", "gridworld"])
+def test_tasks_in_a_file_come_back(name, tmp_path):
+    env = envs.make(name)
+    tasks = jax.tree.map(np.asarray, sample_tasks(env, 3, 4))
+    save_tasks(tmp_path / "tasks.npz", tasks)
+    loaded = load_tasks(tmp_path / "tasks.npz", env)
+    assert_trees_equal(loaded, tasks)
+    for index in range(4):
+        assert_trees_equal(task_at(loaded, index), task_at(tasks, index))
+
+
+def test_files_that_hold_no_tasks(tmp_path):
+    env, path = envs.make("maze15"), tmp_path / "tasks.npz"
+    with pytest.raises(UsageError, match="no task file"):
+        load_tasks(path, env)
+    tasks = sample_tasks(env, 3, 2)
+    np.savez(path, maze=tasks.maze)
+    with pytest.raises(DataError, match="lacks goal; tasks of maze15 need the arrays maze, goal"):
+        load_tasks(path, env)
+    np.savez(path, maze=tasks.maze[:0], goal=tasks.goal[:0])
+    with pytest.raises(DataError, match="holds no tasks"):
+        load_tasks(path, env)
+    np.savez(path, maze=tasks.maze, goal=tasks.goal * 0)
+    with pytest.raises(DataError, match=r"tasks\.npz: task 0: goal \(0, 0\) is not a free cell"):
+        load_tasks(path, env)
 
 
 @pytest.mark.parametrize(("name", "demonstrates"), [("gridworld", True), ("maze15", False)])
 def test_what_a_policy_makes_of_a_demonstration(name, demonstrates):
     """Is measured where the demonstrator does the task at hand."""
-    env = envs.make(name)
+    world = envs.find(name)
+    env = world.make()
     config = network_config(env.spec, embed_dim=8, num_layers=1, num_heads=1, dropout=0.0)
-    _, demonstrator = find_demonstrator(env, None)
+    _, demonstrator = find_demonstrator(world, env, None)
     prompt = single_goal(env.task_goal(env.sample_task(jax.random.key(0))), 5)
-    obs = jnp.zeros((2, env.spec.obs_dim))
+    obs = jnp.zeros((2, *env.spec.obs.shape))
     params = GoalTransformer(config).init(jax.random.key(0), prompt, obs, jnp.zeros(2, jnp.int32))
-    found = greedy_evaluation(env, config, demonstrator, 4)(params)
+    found = GreedyEvaluation(world, env, config, demonstrator, 4)(params)
     assert ("eval/followed_return" in found) == demonstrates
     assert all(np.isfinite(value) for value in found.values())
     assert found["eval/initial_return"] < 0.9

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import mgpo_jax.transformer
+from mgpo_jax.prompts import Prompt
 from mgpo_jax.transformer import GoalTransformer, TransformerConfig, grow_cache
-from mgpo_jax.types import Prompt
 
 T, P = 8, 3
 CONFIG = TransformerConfig(
-    obs_dim=3,
+    obs_shape=(3,),
     goal_dim=2,
     action_dim=4,
     horizon=T,
@@ -32,7 +32,7 @@ def make_inputs(config, seed=0):
     prompt = Prompt(
         jax.random.normal(key_goals, (P, config.goal_dim)), jnp.array([False, True, True])
     )
-    obs = jax.random.normal(key_obs, (T, config.obs_dim))
+    obs = jax.random.normal(key_obs, (T, *config.obs_shape))
     if config.head == "categorical":
         actions = jax.random.randint(key_actions, (T,), 0, config.action_dim)
     else:
@@ -199,7 +199,7 @@ def test_order_of_the_prompt(prompt_order, num_layers, order_matters):
 
 @pytest.mark.parametrize(("horizon", "head"), [(64, "categorical"), (500, "gaussian")])
 def test_sizes_of_table_6(horizon, head):
-    config = TransformerConfig(6, 2, 5, horizon, head)
+    config = TransformerConfig((6,), 2, 5, horizon, head=head)
     network = GoalTransformer(config)
     float_ = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.float32)  # noqa: E731
     prompt = Prompt(float_(5, 2), jax.ShapeDtypeStruct((5,), bool))

@@ -12,24 +12,25 @@ import pytest
 from jax.flatten_util import ravel_pytree
 from scipy import special, stats
 
+from envs.base import Trajectory
+from envs.errors import UsageError
 from mgpo_jax.dataset import BatchPlan, Dataset
-from mgpo_jax.pretrain import (
-    TrainConfig,
+from mgpo_jax.prompts import hindsight_outcome, sample_prompt
+from mgpo_jax.settings import TrainConfig
+from mgpo_jax.sharding import device_mesh
+from mgpo_jax.training import (
+    Trainer,
     TrainState,
     batch_stream,
     bc_loss,
     blurred,
     learning_rate_schedule,
-    make_trainer,
 )
-from mgpo_jax.prompts import hindsight_outcome, sample_prompt
-from mgpo_jax.sharding import device_mesh
 from mgpo_jax.transformer import GoalTransformer, TransformerConfig
-from mgpo_jax.types import Trajectory
 
 HORIZON = 6
 NETWORK = TransformerConfig(
-    obs_dim=3, goal_dim=2, action_dim=3, horizon=HORIZON, max_prompt_length=3,
+    obs_shape=(3,), goal_dim=2, action_dim=3, horizon=HORIZON, max_prompt_length=3,
     embed_dim=16, num_layers=1, dropout=0.0,
 )  # fmt: skip
 # Buckets as long as the horizon: one shape, one compilation.
@@ -49,7 +50,7 @@ def make_dataset():
     return Dataset(
         obs=np.eye(3, dtype=np.float32)[actions],
         actions=actions,
-        goals=goals,
+        achieved_goals=goals,
         goal_reached=np.ones(total, bool),
         outcomes=goals,
         lengths=lengths,
@@ -71,7 +72,7 @@ def parts_of(size):
 @pytest.fixture(scope="module")
 def noisy_trainer():
     """Dropout, random prompts, two devices."""
-    return make_trainer(CONFIG, replace(NETWORK, dropout=0.1), DATASET, device_mesh(2))
+    return Trainer(CONFIG, replace(NETWORK, dropout=0.1), DATASET, device_mesh(2))
 
 
 def run(trainer, state, num_steps):
@@ -106,7 +107,7 @@ def test_the_loss_falls_and_a_resumed_run_equals_an_uninterrupted_one(noisy_trai
 def gradient(network, part_size, num_devices):
     """The gradient of the whole data set: AdamW's first moment is a tenth of the first one."""
     config = replace(CONFIG, part_size=part_size, optimizer="adamw")
-    trainer = make_trainer(config, network, DATASET, device_mesh(num_devices))
+    trainer = Trainer(config, network, DATASET, device_mesh(num_devices))
     state = trainer.init()
     params = to_host(state.params)
     state, metrics = trainer.step(state, parts_of(part_size))
@@ -168,7 +169,7 @@ def loss_of():
 @pytest.fixture(scope="module")
 def params():
     rng = np.random.default_rng(0)
-    trainer = make_trainer(CONFIG, NETWORK, DATASET, device_mesh(1))
+    trainer = Trainer(CONFIG, NETWORK, DATASET, device_mesh(1))
     shapes = jax.eval_shape(trainer.init).params
     return jax.tree.map(
         lambda leaf: jnp.asarray(0.3 * rng.standard_normal(leaf.shape), leaf.dtype), shapes
@@ -200,7 +201,7 @@ def test_bc_loss_ignores_padding(loss_of, params):
     junk = one._replace(
         obs=one.obs.at[4:].set(7.0),
         actions=one.actions.at[4:].set(2),
-        goals=one.goals.at[4:].set(-5.0),
+        achieved_goals=one.achieved_goals.at[4:].set(-5.0),
         goal_reached=jnp.ones(HORIZON, bool),
         outcomes=one.outcomes.at[4:].set(9.0),
     )
@@ -232,7 +233,7 @@ def long():
     return Trajectory(
         obs=jnp.zeros((num, 3)),
         actions=jnp.zeros(num, jnp.int32),
-        goals=jnp.zeros((num, 2)),
+        achieved_goals=jnp.zeros((num, 2)),
         goal_reached=jnp.zeros(num, bool),
         outcomes=jnp.zeros((num, 2)),
         length=jnp.int32(num),
@@ -263,12 +264,11 @@ def test_noise_is_for_training_only(params):
 
 @pytest.mark.parametrize("size", [-1.0, float("nan"), float("inf")])
 def test_noise_is_finite_and_not_negative(size):
-    with pytest.raises(
-        ValueError, match=f"obs_noise must be finite and not negative, found {size}"
-    ):
-        make_trainer(replace(CONFIG, obs_noise=size), NETWORK, DATASET, device_mesh(1))
+    says = "at least 0" if np.isfinite(size) else "a finite number"
+    with pytest.raises(UsageError, match=f"--obs-noise must be {says}, found {size}"):
+        Trainer(replace(CONFIG, obs_noise=size), NETWORK, DATASET, device_mesh(1))
 
 
 def test_devices_must_divide_the_parts():
-    with pytest.raises(ValueError, match="part_size 3 does not divide over 2 devices"):
-        make_trainer(replace(CONFIG, part_size=3), NETWORK, DATASET, device_mesh(2))
+    with pytest.raises(UsageError, match="part_size 3 does not divide over 2 devices"):
+        Trainer(replace(CONFIG, part_size=3), NETWORK, DATASET, device_mesh(2))

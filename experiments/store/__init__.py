@@ -1,0 +1,1 @@
+"""What lies on disk: settings, results, policies, tables."""

@@ -1,0 +1,39 @@
+"""A method of a user: acts under prompts drawn from the last episode, and keeps the luckiest."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from mgpo_jax import Adapter, LoadedPolicy, Method, Query, sample_prompt
+from mgpo_jax.prompts import single_goal
+from mgpo_jax.rollout import prompted
+from mgpo_jax.settings import number
+
+
+@dataclass(frozen=True)
+class LuckyHyper:
+    longest: int = number(3, at_least=1)  # Goals of the longest prompt to draw.
+    thrift: float = number(0.0, at_least=0)  # How much better a prompt must be to be kept.
+
+
+def make_lucky(setting, params, hyper):
+    policy = LoadedPolicy(setting.network, params, {}).policy
+
+    def init(key, goal):
+        first = single_goal(goal, policy.num_slots)
+        return goal, first, (jnp.float32(-jnp.inf), first)
+
+    def tell(key, state, query, episodes):
+        goal, _, kept = state
+        goals, found = jax.tree.map(lambda x: x[0], (episodes.trajectory.goals, episodes.return_))
+        better = found > kept[0] + hyper.thrift
+        kept = jax.tree.map(lambda a, b: jnp.where(better, a, b), (found, query.prompt), kept)
+        return goal, sample_prompt(key, goals, goal, policy.num_slots, hyper.longest), kept
+
+    ask = lambda key, state: (Query(state[1], greedy=False), state)  # noqa: E731
+    agent = lambda state, query: prompted(policy, query)  # noqa: E731
+    return Adapter(init, ask, agent, tell, best=lambda state: Query(state[2][1], greedy=True))
+
+
+METHOD = Method(name="lucky", make=make_lucky, hyper=LuckyHyper, summary="keeps lucky prompts")
