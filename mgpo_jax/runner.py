@@ -170,14 +170,9 @@ def sweep(
     per_lane = episodes + (len(segments) + 1) * setting.judged.episodes
     # The search, too, begins with one evaluation of the initial choice.
     after = np.concatenate([[1], np.cumsum(segments) * adapter.episodes_per_round])
+    total = round(layout.num_lanes * per_lane / len(hypers))
     return [
-        record.outcome(
-            variant=variant,
-            grid=grid,
-            after=after,
-            num_episodes=round(layout.num_lanes * per_lane / len(hypers)),
-            cpu_seconds=cpu / len(hypers),
-        )
+        record.outcome(variant, grid, after, num_episodes=total, cpu_seconds=cpu / len(hypers))
         for variant in range(len(hypers))
     ]
 
