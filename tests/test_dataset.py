@@ -275,7 +275,10 @@ def test_no_folder(tmp_path):
 
 
 ARRAY_DAMAGE = {
-    "missing array": (lambda a: a.pop("achieved_goals"), "does not hold the arrays.*collect it again"),
+    "missing array": (
+        lambda a: a.pop("achieved_goals"),
+        "does not hold the arrays.*collect it again",
+    ),
     "unknown array": (lambda a: a.update(x=a["obs"]), "does not hold the arrays"),
     "NaN": (lambda a: a["obs"].__setitem__((5, 1), np.nan), "obs holds NaN .*first at step 5"),
     "infinity": (
@@ -401,7 +404,7 @@ def test_datasets_of_format_1_are_read(folder, dataset):
 def test_a_dataset_of_format_1_without_goals(folder):
     write_format_1(folder)
     rewrite(folder, lambda arrays: arrays.pop("goals"))
-    with pytest.raises(DataError, match="does not hold the arrays.*collect it again"):
+    with pytest.raises(DataError, match=r"does not hold the arrays.*collect it again"):
         load_dataset(folder, SPEC)
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from envs.base import Episode, Trajectory
-from mgpo_jax.optimizers import OPTIMIZERS, SearchSpace
+from mgpo_jax.optimizers import SearchSpace, bbt, bpe, explore, grips, ucb
 from mgpo_jax.optimizers.arms import (
     SHRINKAGE,
     empty_arms,
@@ -28,6 +28,7 @@ from mgpo_jax.optimizers.ucb import upper_confidence_bounds
 from mgpo_jax.prompts import Prompt, single_goal
 from mgpo_jax.rollout import Query
 
+OPTIMIZERS = {"ucb": ucb, "bpe": bpe, "explore": explore, "grips": grips, "bbt": bbt}
 NUM_SLOTS, NUM_STEPS, NUM_EPISODES = 4, 6, 24
 TASK_GOAL = jnp.array([0.9, 0.8])
 RANGE = (-1.0, 2.0)

@@ -25,6 +25,8 @@ from mgpo_jax.tasks import (
     save_tasks,
     task_at,
     task_hashes,
+)
+from mgpo_jax.tasks import (
     test_tasks as tasks_to_test,  # pytest would take it for a test
 )
 from mgpo_jax.transformer import GoalTransformer, network_config
@@ -54,14 +56,8 @@ def test_test_tasks_are_those_that_were_released(name):
     assert_trees_equal(tasks, load_tasks(released_folder(world) / "tasks.npz", env))
     drawn = benchmark_tasks(env, world.num_test_tasks)
     assert_trees_equal(tasks, jax.tree.map(np.asarray, drawn))
-    prints = np.unique(
-        np.concatenate(
-            [np.asarray(leaf).reshape(num_tasks(tasks), -1) for leaf in jax.tree.leaves(tasks)],
-            axis=1,
-        ),
-        axis=0,
-    )
-    assert len(prints) == num_tasks(tasks)
+    rows = [np.asarray(leaf).reshape(num_tasks(tasks), -1) for leaf in jax.tree.leaves(tasks)]
+    assert len(np.unique(np.concatenate(rows, axis=1), axis=0)) == num_tasks(tasks)
 
 
 @dataclass(frozen=True)

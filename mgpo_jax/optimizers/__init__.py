@@ -1,8 +1,6 @@
-"""Prompt optimizers by the name ``--bandit`` knows (paper, section 4.3, Table 2)."""
+"""Prompt optimizers (paper, section 4.3, Table 2). ``methods.py`` lifts them into methods."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 from mgpo_jax.optimizers.base import PromptOptimizer, SearchSpace
 from mgpo_jax.optimizers.bbt import bbt
@@ -11,12 +9,4 @@ from mgpo_jax.optimizers.explore import explore
 from mgpo_jax.optimizers.grips import grips
 from mgpo_jax.optimizers.ucb import ucb
 
-__all__ = ["OPTIMIZERS", "PromptOptimizer", "SearchSpace", "bbt", "bpe", "explore", "grips", "ucb"]
-
-OPTIMIZERS: dict[str, Callable[..., PromptOptimizer]] = {
-    "ucb": ucb,
-    "bpe": bpe,
-    "explore": explore,
-    "grips": grips,
-    "bbt": bbt,
-}
+__all__ = ["PromptOptimizer", "SearchSpace", "bbt", "bpe", "explore", "grips", "ucb"]
