@@ -234,7 +234,7 @@ class Environment:
 
     def fingerprint(self, task: Task) -> Int[Array, "F"]:
         """What must differ between the tasks of training and test (default: all bytes of the task)."""
-        leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves(task)]
+        leaves = [_without_key(jnp.asarray(leaf)) for leaf in jax.tree.leaves(task)]
         leaves = [leaf.astype(jnp.uint8) if leaf.dtype == bool else leaf for leaf in leaves]
         as_bytes = [jax.lax.bitcast_convert_type(leaf, jnp.uint8).ravel() for leaf in leaves]
         return jnp.concatenate(as_bytes).astype(jnp.int32)
@@ -248,11 +248,20 @@ class Environment:
         check_shapes(tasks, jax.eval_shape(self.sample_task, jax.random.key(0)))
 
 
+def _without_key(leaf: Array) -> Array:
+    """The raw data of random keys; any other array as it is."""
+    is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return jax.random.key_data(leaf) if is_key else leaf
+
+
 def check_shapes(tasks: Task, example: Task) -> None:
     """Raise ``ValueError`` for the first array of N stacked tasks that holds no tasks like ``example``."""
     paths, _ = jax.tree_util.tree_flatten_with_path(example)
+    leaves = jax.tree.leaves(tasks)
+    if len(leaves) != len(paths):
+        raise ValueError(f"a task has {len(paths)} arrays, found {len(leaves)}")
     num: int | None = None  # N, once the first array has told it
-    for (path, like), leaf in zip(paths, jax.tree.leaves(tasks), strict=True):
+    for (path, like), leaf in zip(paths, leaves, strict=True):
         name, array = jax.tree_util.keystr(path, simple=True) or "the task", np.asarray(leaf)
         stacked = array.ndim == like.ndim + 1 and array.shape[1:] == like.shape
         if not stacked or len(array) != (len(array) if num is None else num):

@@ -56,6 +56,7 @@ class _Loop(NamedTuple):
     rewards: Array
     return_: Array
     last_obs: Array
+    failed: Array
 
 
 def run_episode(key: PRNGKeyArray, env: Environment, agent: Agent, task: Task) -> Episode:
@@ -82,6 +83,7 @@ def run_episode(key: PRNGKeyArray, env: Environment, agent: Agent, task: Task) -
         rewards=jnp.zeros(horizon),
         return_=jnp.zeros(()),
         last_obs=timestep.obs,
+        failed=jnp.asarray(timestep.failed),
     )
     loop = _act(env, loop, action)
 
@@ -102,7 +104,7 @@ def run_episode(key: PRNGKeyArray, env: Environment, agent: Agent, task: Task) -
         rewards=loop.rewards,
         return_=loop.return_,
         last_obs=loop.last_obs,
-        failed=loop.timestep.failed,
+        failed=loop.failed,
         decisions=agent.decisions(loop.memory),
     )
 
@@ -173,4 +175,5 @@ def _act(env: Environment, loop: _Loop, action: Array) -> _Loop:
         # Summed step by step: equal rewards make equal returns, whenever they came.
         return_=loop.return_ + jnp.where(alive, timestep.reward, 0.0),
         last_obs=jnp.where(alive, timestep.obs, loop.last_obs),
+        failed=jnp.where(alive, timestep.failed, loop.failed),
     )

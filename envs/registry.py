@@ -11,6 +11,7 @@ import math
 import os
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
@@ -35,6 +36,11 @@ class Judgement:
     mode: Literal["greedy", "sample"] = "greedy"
     temperature: float = 1.0
     episodes: int = 1
+
+    @property
+    def tempered(self) -> bool:
+        """Whether actions are drawn from another distribution than the policy's own."""
+        return self.mode == "sample" and self.temperature != 1
 
     def __post_init__(self) -> None:
         if not (0 < self.temperature < math.inf and self.episodes >= 1):
@@ -112,6 +118,14 @@ class Registry(Generic[Record]):
         found = [point.name for point in entry_points(group=self.group)]
         return list(dict.fromkeys([*self._places, *self._registered, *found]))
 
+    def usable(self) -> list[Record]:
+        """All records that can be imported, the built-in ones first."""
+        found = []
+        for name in self.names():
+            with suppress(UsageError):
+                found.append(self.find(name))
+        return found
+
     def find(self, name: str) -> Record:
         """The record of that name.
 
@@ -142,6 +156,15 @@ class Registry(Generic[Record]):
         if not isinstance(record, self.type):
             raise UsageError(
                 f"{place} is a {type(record).__name__}, not a {self.type.__name__} record"
+            )
+        name: str = record.name  # type: ignore[attr-defined]
+        taken = self._registered.get(name)
+        if taken is None and self._places.get(name, place) != place:
+            taken = self.find(name)
+        if taken is not None and taken is not record:
+            # Files are kept under names: another record of that name would use what is not its own.
+            raise UsageError(
+                f"{place} has the name of the {self.kind} {name!r}; give it another one"
             )
         return record
 

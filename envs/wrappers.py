@@ -114,4 +114,5 @@ class Noisy(Wrapper):
         if not self.env.spec.obs.is_float:
             return timestep
         noise = self.obs_noise * jax.random.normal(key, timestep.obs.shape)
+        noise = noise.astype(timestep.obs.dtype)
         return timestep._replace(obs=timestep.obs + noise)

@@ -12,7 +12,7 @@ from envs.errors import UsageError
 from experiments.runtime import early_values, refuse_existing, run
 from experiments.store.settings import DEFAULT_WORLD, AdaptConfig
 from mgpo_jax import methods
-from mgpo_jax.methods import Method, foreign_setting
+from mgpo_jax.methods import METHODS, Method, foreign_setting
 from mgpo_jax.settings import flag
 
 
@@ -31,9 +31,7 @@ def adapt_default(argv: Sequence[str]) -> AdaptConfig:
 def _refuse_foreign_flags(argv: Sequence[str], method: Method) -> None:
     """Raise ``UsageError`` for a flag that only other methods have."""
     own = {f.name for kind in (AdaptConfig, method.hyper) for f in dataclasses.fields(kind)}
-    others = {
-        f.name for name in methods.names() for f in dataclasses.fields(methods.find(name).hyper)
-    }
+    others = {f.name for other in METHODS.usable() for f in dataclasses.fields(other.hyper)}
     given = {word.split("=", 1)[0].replace("--no-", "--") for word in argv if word[:2] == "--"}
     for name in sorted(others - own):
         if flag(name) in given or f"--{name}" in given:

@@ -41,7 +41,8 @@ def find_demonstrator(world: World, env: Environment, name: str | None) -> tuple
     known = world.demonstrators(env)
     if not known:
         raise UsageError(
-            f"{world.name} has no demonstrators, so no dataset can be collected; bring one"
+            f"{world.name} has no demonstrators, so no dataset can be collected; train on one of your own "
+            "with mgpo_jax.pretrain"
         )
     name = name or next(iter(known))
     if name not in known:
@@ -142,7 +143,7 @@ def collect(
     forbidden = task_hashes(env, benchmark_tasks(env, num_test_tasks))
     attempts = _Attempts(env.spec.name)
     kept: list[dict[str, np.ndarray]] = []
-    num_kept = num_test = num_failed = 0
+    num_kept = num_test = num_failed = fruitless = 0
     with tqdm(total=num, unit="trajectory", disable=None) as progress:
         for batch in count():
             keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), batch), BATCH)
@@ -159,6 +160,12 @@ def collect(
             progress.update(len(rows))
             if num_kept >= num:
                 break
+            fruitless = 0 if len(rows) else fruitless + 1
+            if fruitless >= MAX_TRIES:
+                raise DataError(
+                    f"nothing to keep in {MAX_TRIES * BATCH} attempts: nearly every task of "
+                    f"{env.spec.name} is a test task or its demonstrations are dropped"
+                )
     arrays = {name: np.concatenate([part[name] for part in kept]) for name in kept[0]}
     returns = arrays.pop("returns")
     dataset = Dataset(**arrays)

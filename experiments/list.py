@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NoReturn
 
-import envs
+from envs.errors import UsageError
+from envs.registry import WORLDS
 from experiments.runtime import Common, run
-from mgpo_jax import methods
+from mgpo_jax.methods import METHODS
 
 
 @dataclass(frozen=True)
@@ -19,13 +20,16 @@ class ListConfig(Common):
 def main(config: ListConfig) -> None:
     """List the worlds and methods that are known by name."""
     del config
-    print("worlds (--env)")
-    for name in envs.names():
-        print(f"  {name:<16} {envs.find(name).summary}")
-    print("\nmethods (--method)")
-    for name in methods.names():
-        print(f"  {name:<16} {methods.find(name).summary}")
-    print("\nOthers are given as module:attribute, such as --env my_package.my_world:WORLD.")
+    for title, registry in (("worlds (--env)", WORLDS), ("methods (--method)", METHODS)):
+        print(title)
+        for name in registry.names():
+            try:
+                summary = registry.find(name).summary
+            except UsageError as error:  # of a package that is installed beside this one
+                summary = str(error)
+            print(f"  {name:<16} {summary}")
+        print()
+    print("Others are given as module:attribute, such as --env my_package.my_world:WORLD.")
 
 
 def command(argv: Sequence[str] | None = None) -> NoReturn:

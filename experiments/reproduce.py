@@ -27,10 +27,10 @@ def main(config: ReproduceConfig) -> None:
     from experiments.ablations import MAKE, as_table, draw
 
     lines = MAKE[config.what](config)
-    budget = (
-        f", {config.num_steps:,} gradient steps on {config.num_trajectories:,} trajectories each"
-    )
-    budget = "" if config.what == "table4" else budget
+    budget = ""
+    if config.what != "table4":  # which trains nothing
+        steps, trajectories = config.num_steps, config.num_trajectories
+        budget = f", {steps:,} gradient steps on {trajectories:,} trajectories each"
     text = f"{config.env}, UCB, {config.seeds} seeds{budget}\n\n{as_table(lines)}\n"
     print(text)
     place = config.folder / f"{config.what}.md"

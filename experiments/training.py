@@ -174,7 +174,7 @@ class Run:
         cut = len(dataset) - config.holdout
         self.fit, held_out = dataset.slice(0, cut), dataset.slice(cut, len(dataset))
         self.trainer = Trainer(config.train, self.network, self.fit, self.mesh)
-        self._held_out_trainer = Trainer(config.train, self.network, held_out, self.mesh)
+        self._held_out = held_out
         self.truncate = env.spec.truncate_in_hindsight
         self._held_out_parts = self._validation_parts(held_out, env.spec.horizon)
         _, demonstrator = find_demonstrator(world, env, config.data.demonstrator)
@@ -189,7 +189,7 @@ class Run:
 
     def measure(self, params: Any) -> dict[str, float]:
         """Losses on held-out trajectories and greedy returns."""
-        held = self._held_out_trainer.evaluate(params, self._held_out_parts)
+        held = self.trainer.evaluate(params, self._held_out_parts, self._held_out)
         return {**{f"val/{k}": v for k, v in held.items()}, **self._greedy(params)}
 
     def batches(self, first_step: int) -> Iterator[list[BatchPlan]]:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         TimeStep,
         Trajectory,
     )
+    from envs.episodes import replay, run_episode
     from envs.errors import DataError, UsageError
     from envs.registry import Judgement, World, make
     from envs.registry import names as world_names
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from mgpo_jax.optimizers.methods import prompt_adapter
     from mgpo_jax.policy import LoadedPolicy, Policy
     from mgpo_jax.policy_files import load_policy, save_policy
-    from mgpo_jax.prompts import Prompt, prompt_of, sample_prompt, single_goal
+    from mgpo_jax.prompts import Prompt, goals_of, prompt_of, sample_prompt, single_goal
     from mgpo_jax.rollout import Query, prompted
     from mgpo_jax.runner import Outcome, adapt, evaluate, play, sweep
     from mgpo_jax.settings import TrainConfig, number
@@ -49,6 +50,7 @@ _PLACES = {
         "Agent", "ArraySpec", "Box", "Demonstrator", "Discrete", "EnvSpec", "Environment", "Episode",
         "TimeStep", "Trajectory",
     ),
+    "envs.episodes": ("replay", "run_episode"),
     "envs.errors": ("DataError", "UsageError"),
     "envs.registry": ("Judgement", "World", "make"),
     "mgpo_jax.acting": ("Actor",),
@@ -59,7 +61,7 @@ _PLACES = {
     "mgpo_jax.optimizers.methods": ("prompt_adapter",),
     "mgpo_jax.policy": ("LoadedPolicy", "Policy"),
     "mgpo_jax.policy_files": ("load_policy", "save_policy"),
-    "mgpo_jax.prompts": ("Prompt", "prompt_of", "sample_prompt", "single_goal"),
+    "mgpo_jax.prompts": ("Prompt", "goals_of", "prompt_of", "sample_prompt", "single_goal"),
     "mgpo_jax.rollout": ("Query", "prompted"),
     "mgpo_jax.runner": ("Outcome", "adapt", "evaluate", "play", "sweep"),
     "mgpo_jax.settings": ("TrainConfig", "number"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -10,9 +11,23 @@ import numpy as np
 
 from envs.episodes import segment_length
 from envs.errors import UsageError
-from mgpo_jax.policy import LoadedPolicy
+from mgpo_jax.policy import LoadedPolicy, transformer_policy
 from mgpo_jax.prompts import Prompt, prompt_of
 from mgpo_jax.rollout import Query, act
+from mgpo_jax.transformer import TransformerConfig
+
+
+@cache
+def _compiled(config: TransformerConfig) -> tuple[Any, Any]:
+    """Prefill and decode with the weights as data, so that policies of one network share them."""
+
+    def prefill(params: Any, prompt: Prompt, obs: jax.Array) -> Any:
+        return transformer_policy(config, params).prefill(prompt, obs)
+
+    def decode(params: Any, carry: Any, action: jax.Array, obs: jax.Array) -> Any:
+        return transformer_policy(config, params).decode(carry, action, obs)
+
+    return jax.jit(prefill), jax.jit(decode)
 
 
 class Actor:
@@ -40,8 +55,9 @@ class Actor:
         self._functions = policy.policy
         self._key = jax.random.key(seed)
         self._greedy = jnp.asarray(greedy)
-        self._prefill = jax.jit(self._functions.prefill)
-        self._decode = jax.jit(self._functions.decode)
+        self._prefill, self._decode = (
+            partial(function, policy.params) for function in _compiled(policy.config)
+        )
         self._step = 0
         self.prompt = goals
 

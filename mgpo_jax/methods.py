@@ -57,7 +57,7 @@ class Method:
       hyper: the frozen dataclass of its hyper-parameters; flags, help and checks are made from it.
       check: ``(setting, hyper) -> None``, or its place, raises ``UsageError`` where the method cannot be
         used.
-      title: its name in tables and legends.
+      title: its name in legends [the name].
       summary: what it is, in one line.
     """
 
@@ -106,7 +106,7 @@ def load(place: str | Callable) -> Callable:
 
 def foreign_setting(name: str, method: Method) -> UsageError:
     """The error for a hyper-parameter that the method does not have, with the methods that do."""
-    others = [other for other in map(METHODS.find, names()) if other.name != method.name]
+    others = [other for other in METHODS.usable() if other.name != method.name]
     having = [
         other.name
         for other in others

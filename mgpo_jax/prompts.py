@@ -73,6 +73,7 @@ def until_reached(goals: Goals, goal: Float[Array, "G"]) -> Goals:
     return goals._replace(length=length.astype(goals.length.dtype))
 
 
+# Long because of its documentation; the drawing itself is one thought.
 def sample_prompt(
     key: PRNGKeyArray,
     trajectory: Trajectory | Goals,

@@ -18,13 +18,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh
 from jaxtyping import Array, PRNGKeyArray
 from tqdm import tqdm
 
 from envs.base import Environment, Episode, Goals, Task
 from envs.errors import UsageError
-from envs.registry import Judgement
+from envs.registry import Judgement, World
+from envs.registry import find as find_world
 from mgpo_jax.adaptation import (
     Adapter,
     AdaptLog,
@@ -35,7 +36,7 @@ from mgpo_jax.adaptation import (
 from mgpo_jax.methods import Method, Setting, find, split_hyper, with_numbers
 from mgpo_jax.policy import LoadedPolicy, check_fits, transformer_policy
 from mgpo_jax.rollout import Query, rollout
-from mgpo_jax.sharding import AXIS, device_mesh, fetch, replicate, split
+from mgpo_jax.sharding import device_mesh, fetch, on_devices, replicate, split
 from mgpo_jax.tasks import num_tasks
 from mgpo_jax.transformer import TransformerConfig
 
@@ -66,6 +67,8 @@ class Outcome(NamedTuple):
     """Who acted, leaves ``[S, N, R, ..]``."""
     best: Any
     """The best choice after each round, leaves ``[S, N, R, ..]``."""
+    lengths: np.ndarray
+    """``[S, N, E]``: steps of the episodes."""
     keys: np.ndarray
     """``[S, N, E, 2]``: raw random keys of the episodes."""
     actions: np.ndarray | None
@@ -90,24 +93,35 @@ def together(env: Environment, function: Callable, in_axes: Any = 0) -> Any:
 
 
 def adapt(
-    env: Environment,
+    world: World | Environment | str,
     policy: LoadedPolicy,
     tasks: Task,
     method: Method | str = "ucb",
     hyper: Any = None,
-    **options: Any,
+    *,
+    seeds: int = 3,
+    episodes: int = 100,
+    seed: int = 0,
+    eval_every: int = 10,
+    judged: Judgement | None = None,
+    keep_actions: bool = False,
 ) -> Outcome:
     """Adapt a policy to every task with every seed.
 
     Args:
-      env: the world.
+      world: the world, as its record, its name or place, or as an environment.
       policy: who starts.
       tasks: N tasks, stacked.
       method: who adapts, as a record or by name.
       hyper: the method's hyper-parameters, as its record or as a dict of those that differ from the
         defaults.
-      **options: those of ``sweep``: ``seeds``, ``episodes``, ``seed``, ``eval_every``, ``judged`` and
-        ``keep_actions``.
+      seeds: independent adaptations to each task.
+      episodes: the budget of each.
+      seed: seed of all of them.
+      eval_every: episodes between judgements of the best choice.
+      judged: how the best choice is judged (default: as the world's record says; for an environment
+        without a record, one greedy episode).
+      keep_actions: whether to keep continuous actions; discrete ones are always kept.
 
     Raises:
       UsageError: if the method cannot be used in this setting.
@@ -115,7 +129,25 @@ def adapt(
     method = find(method) if isinstance(method, str) else method
     if hyper is None or isinstance(hyper, dict):
         hyper = method.hyper_from(hyper or {})
-    (outcome,) = sweep(env, policy, tasks, method, [hyper], **options)
+    if isinstance(world, str):
+        world = find_world(world)
+    if isinstance(world, World):
+        env, judged = world.make(), judged or world.judged
+    else:
+        env = world
+    (outcome,) = sweep(
+        env,
+        policy,
+        tasks,
+        method,
+        [hyper],
+        seeds=seeds,
+        episodes=episodes,
+        seed=seed,
+        eval_every=eval_every,
+        judged=judged,
+        keep_actions=keep_actions,
+    )
     return outcome
 
 
@@ -276,17 +308,14 @@ def _lay_out(env: Environment, num_lanes: int, memory_bytes: int) -> Layout:
 
 def _over_lanes(env: Environment, layout: Layout, function: Callable) -> Any:
     """A jitted ``function(own, shared)`` over all lanes."""
-    spread, copied = PartitionSpec(AXIS), PartitionSpec()
 
     def on_device(own: Any, shared: Any) -> Any:
         grouped = jax.tree.map(lambda leaf: leaf.reshape(-1, layout.group, *leaf.shape[1:]), own)
         done = jax.lax.map(lambda own: jax.vmap(function, in_axes=(0, None))(own, shared), grouped)
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), done)
 
-    mapped = jax.shard_map(
-        on_device, mesh=layout.mesh, in_specs=(spread, copied), out_specs=spread, check_vma=False
-    )
-    return jax.jit(mapped, compiler_options=dict(env.engine.compiler_options))
+    options = dict(env.engine.compiler_options)
+    return on_devices(layout.mesh, on_device, [True, False], True, compiler_options=options)
 
 
 class Program:
@@ -304,7 +333,7 @@ class Program:
         return self._compiled[where]
 
 
-class Search(NamedTuple):
+class Programs(NamedTuple):
     """The two programs of an adaptation."""
 
     start: Program
@@ -322,7 +351,7 @@ def _program(
     layout: Layout,
     max_rounds: int,
     keep_actions: bool,
-) -> Search:
+) -> Programs:
     """The programs that search with a method; equal arguments share them within a process."""
     env = setting.env
 
@@ -345,7 +374,7 @@ def _program(
             keep_actions=keep_actions,
         )
 
-    return Search(
+    return Programs(
         Program(_over_lanes(env, layout, begin)),
         Program(_over_lanes(env, layout, advance)),
         setting.judged.episodes,
@@ -379,6 +408,7 @@ class Record(NamedTuple):
             failed=failed,
             choices=jax.tree.map(of_variant, self.log.choices),
             best=jax.tree.map(of_variant, self.log.best),
+            lengths=np.concatenate([by_episode(goals.length) for goals in self.reached], axis=2),
             keys=by_episode(self.log.played.key),
             actions=jax.tree.map(by_episode, self.log.played.actions),
             reached=_reached([jax.tree.map(by_episode, goals) for goals in self.reached]),
@@ -391,16 +421,16 @@ class Record(NamedTuple):
 
 
 def _run(
-    search: Search, lanes: Lanes, params: Any, segments: Sequence[int], grid: Grid
+    programs: Programs, lanes: Lanes, params: Any, segments: Sequence[int], grid: Grid
 ) -> tuple[Record, float]:
     """Run all segments of an adaptation, each followed by a judgement; the first judgement comes before.
 
     The second result is the CPU time that it took, without compilation.
     """
-    state = search.start.compile(lanes, params)(lanes, params)
+    state = programs.start.compile(lanes, params)(lanes, params)
     logs: list[AdaptLog] = []
     judgements: list[Judged] = []
-    advance = search.advance.compile((state, lanes), (params, jnp.int32(0), jnp.int32(0)))
+    advance = programs.advance.compile((state, lanes), (params, jnp.int32(0), jnp.int32(0)))
     cpu = time.process_time()
 
     with tqdm(total=1, unit="episode", disable=None) as progress:
@@ -454,10 +484,27 @@ def evaluate(
 
     The second result is how many episodes a broken world ended.
     """
-    network = policy.config
-    check_fits(network, env.spec)
+    check_fits(policy.config, env.spec)
     seeds, num = queries.prompt.mask.shape[:2]
     grid = Grid(variants=1, seeds=seeds, tasks=num)
+    layout = _lay_out(env, grid.size, cache_bytes(policy.config))
+    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), queries)
+    index = np.arange(layout.num_lanes) % grid.size
+    own = (
+        grid.lanes(layout, tasks, seed, {}),
+        jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], flat),
+    )
+    run = _measurement(env, policy.config, layout, episodes)
+    found = fetch(run(split(layout.mesh, own), replicate(layout.mesh, policy.params)))
+    found = jax.tree.map(lambda rows: grid.shape(rows)[0], found)
+    return found.return_, int(found.num_failed.sum())
+
+
+@cache
+def _measurement(
+    env: Environment, network: TransformerConfig, layout: Layout, num_episodes: int
+) -> Any:
+    """``((lanes, queries), params) -> judged``, compiled once a process."""
 
     def measure(own: tuple[Lanes, Query], params: Any) -> Judged:
         lane, query = own
@@ -467,20 +514,10 @@ def evaluate(
             done = rollout(key, env, policy, lane.task, query)
             return done.return_, jnp.asarray(done.failed)
 
-        returns, failed = jax.lax.map(episode, jax.random.split(lane.key, episodes))
+        returns, failed = jax.lax.map(episode, jax.random.split(lane.key, num_episodes))
         return Judged(returns.mean(), failed.sum())
 
-    layout = _lay_out(env, grid.size, cache_bytes(network))
-    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), queries)
-    index = np.arange(layout.num_lanes) % grid.size
-    own = (
-        grid.lanes(layout, tasks, seed, {}),
-        jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], flat),
-    )
-    run = _over_lanes(env, layout, measure)
-    found = fetch(run(split(layout.mesh, own), replicate(layout.mesh, policy.params)))
-    found = jax.tree.map(lambda rows: grid.shape(rows)[0], found)
-    return found.return_, int(found.num_failed.sum())
+    return _over_lanes(env, layout, measure)
 
 
 def cache_bytes(network: TransformerConfig) -> int:

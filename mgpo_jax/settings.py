@@ -57,6 +57,10 @@ def check_settings(settings: Any) -> None:
             raise UsageError(f"{flag(field.name)} must be above {above}, found {value}")
 
 
+RECIPE_NETWORK: dict[str, Any] = {"dropout": 0.0, "num_heads": 4}
+"""How the network of the general recipe differs from the paper's (Table 6)."""
+
+
 @dataclass(frozen=True)
 class TrainConfig:
     """How to train. Values in brackets are the paper's (Table 6) or, marked *, its code's."""

@@ -7,6 +7,7 @@ because small programs on one core each waste less than one program on all).
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -22,14 +23,43 @@ def device_mesh(num_devices: int | None = None) -> Mesh:
     return Mesh(np.asarray(devices), (AXIS,))
 
 
+def spread(mesh: Mesh) -> NamedSharding:
+    """The layout of arrays whose leading axis is divided among the devices."""
+    return NamedSharding(mesh, PartitionSpec(AXIS))
+
+
 def split(mesh: Mesh, tree: Any) -> Any:
     """Put arrays on the mesh, their leading axis divided among the devices."""
-    return jax.device_put(tree, NamedSharding(mesh, PartitionSpec(AXIS)))
+    return jax.device_put(tree, spread(mesh))
 
 
 def replicate(mesh: Mesh, tree: Any) -> Any:
     """Put a copy of every array on each device."""
     return jax.device_put(tree, NamedSharding(mesh, PartitionSpec()))
+
+
+def on_devices(
+    mesh: Mesh, function: Callable, divided: Sequence[bool], result_divided: bool, **options: Any
+) -> Any:
+    """A jitted function that runs on every device by itself, without collectives.
+
+    Args:
+      mesh: the devices.
+      function: what runs on each of them.
+      divided: for each argument, whether its leading axis is divided among the devices; the others are
+        the same on all of them.
+      result_divided: the same for the result.
+      **options: options of ``jax.jit``.
+    """
+    spec = {True: PartitionSpec(AXIS), False: PartitionSpec()}
+    mapped = jax.shard_map(
+        function,
+        mesh=mesh,
+        in_specs=tuple(spec[is_divided] for is_divided in divided),
+        out_specs=spec[result_divided],
+        check_vma=False,
+    )
+    return jax.jit(mapped, **options)
 
 
 def fetch(tree: Any) -> Any:

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 from tqdm import tqdm
 
@@ -26,15 +26,16 @@ from envs.errors import UsageError
 from mgpo_jax.dataset import BatchPlan, Dataset, check_dataset, plan_batches
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.prompts import hindsight_outcome, sample_prompt, single_goal
-from mgpo_jax.settings import TrainConfig, check_settings
+from mgpo_jax.settings import RECIPE_NETWORK, TrainConfig, check_settings
 from mgpo_jax.sharding import (
-    AXIS,
     device_mesh,
     fetch,
     gather_rows,
     largest_divisor,
+    on_devices,
     replicate,
     split,
+    spread,
 )
 from mgpo_jax.transformer import GoalTransformer, TransformerConfig, network_config
 
@@ -120,6 +121,7 @@ def blurred(key: PRNGKeyArray, trajectory: Trajectory, largest: float) -> Trajec
     key_size, key_noise = jax.random.split(key)
     size = largest * jax.random.uniform(key_size)
     noise = size * jax.random.normal(key_noise, trajectory.obs.shape)
+    noise = noise.astype(trajectory.obs.dtype)
     return trajectory._replace(obs=trajectory.obs + noise)
 
 
@@ -191,16 +193,6 @@ def _flatten(params: Any) -> Array:
     return ravel_pytree(params)[0]
 
 
-def _on_devices(
-    mesh: Mesh, function: Callable, in_specs: Any, out_specs: Any, **options: Any
-) -> Any:
-    """A jitted function that runs on every device by itself, without collectives."""
-    mapped = jax.shard_map(
-        function, mesh=mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False
-    )
-    return jax.jit(mapped, **options)
-
-
 class _Accumulator:
     """Sums gradients and statistics over the parts of a batch, a row for each device.
 
@@ -212,7 +204,6 @@ class _Accumulator:
         self, mesh: Mesh, loss: Callable, shapes: Any, unravel: Callable[[Any], Any]
     ) -> None:
         self.mesh = mesh
-        spread, copied = PartitionSpec(AXIS), PartitionSpec()
 
         def add(params: Any, sums: Any, keys: Key[Array, "B"], part: Trajectory) -> Any:
             added = jax.grad(loss, has_aux=True)(params, keys, part, False)
@@ -223,14 +214,13 @@ class _Accumulator:
             grads = jax.tree.map(lambda leaf: jnp.zeros((num, *leaf.shape)), shapes)
             return grads, Stats(*jnp.zeros((3, num)))
 
-        self.unpack = _on_devices(mesh, unravel, copied, copied)
-        self.pack = _on_devices(
-            mesh, lambda sums: (_flatten(sums[0])[None], sums[1]), spread, spread
-        )
-        self.add = _on_devices(
-            mesh, add, (copied, spread, spread, spread), spread, donate_argnums=1
-        )
-        self.zeros = jax.jit(zeros, out_shardings=NamedSharding(mesh, spread))
+        def pack(sums: Any) -> Any:
+            return _flatten(sums[0])[None], sums[1]
+
+        self.unpack = on_devices(mesh, unravel, [False], False)
+        self.pack = on_devices(mesh, pack, [True], True)
+        self.add = on_devices(mesh, add, [False, True, True, True], True, donate_argnums=1)
+        self.zeros = jax.jit(zeros, out_shardings=spread(mesh))
 
     def sums(self, weights: Array, parts: Iterator[tuple[Any, Trajectory]]) -> list[Any]:
         """One ``(gradient vector, Stats)`` for each device, over ``(keys, part)`` pairs."""
@@ -300,7 +290,7 @@ class Trainer:
         self._accumulator = _Accumulator(mesh, loss, shapes, unravel)
         self._update = _make_update(self._optimizer, unravel)
 
-        @partial(jax.jit, static_argnums=2, out_shardings=NamedSharding(mesh, PartitionSpec(AXIS)))
+        @partial(jax.jit, static_argnums=2, out_shardings=spread(mesh))
         def part_keys(step: Any, index: Any, num: int) -> Key[Array, "B"]:
             key = jax.random.fold_in(jax.random.fold_in(key_steps, step), index)
             return jax.random.split(key, num)
@@ -328,11 +318,15 @@ class Trainer:
         params, opt_state, metrics = self._update(state.params, state.opt_state, rows)
         return TrainState(params, opt_state, state.step + 1), metrics
 
-    def evaluate(self, params: Any, plans: list[BatchPlan]) -> dict[str, float]:
-        """Mean loss and accuracy of some weights, without dropout and noise."""
-        stats = [
-            self._part_stats(params, self._key_eval, self._dataset.gather(*plan)) for plan in plans
-        ]
+    def evaluate(
+        self, params: Any, plans: list[BatchPlan], dataset: Dataset | None = None
+    ) -> dict[str, float]:
+        """Mean loss and accuracy of some weights, without dropout and noise.
+
+        ``dataset`` is what the plans are of (default: the one that is trained on).
+        """
+        rows = self._dataset if dataset is None else dataset
+        stats = [self._part_stats(params, self._key_eval, rows.gather(*plan)) for plan in plans]
         total = jax.tree.map(lambda *leaves: float(sum(leaves)), *fetch(stats))
         return {"loss": total.nll / total.num_steps, "accuracy": total.correct / total.num_steps}
 
@@ -362,13 +356,15 @@ def pretrain(
 ) -> LoadedPolicy:
     """Pre-train a policy on a dataset, in memory and from the first step to the last.
 
-    ``experiments.pretrain`` does the same with checkpoints, evaluations and metrics on the way.
+    ``experiments.pretrain`` does the same with a recipe for each world, and with checkpoints, evaluations
+    and metrics on the way.
 
     Args:
       dataset: trajectories of the world.
       spec: the world's facts.
       config: how to train (default: that of ``TrainConfig``).
-      **network: sizes and options of the network that differ from ``TransformerConfig``'s defaults.
+      **network: sizes and options of the network, as in ``TransformerConfig``, that differ from the
+        recipe's (``settings.RECIPE_NETWORK``: no dropout and four heads).
 
     Raises:
       DataError: if the dataset does not fit the world.
@@ -376,7 +372,7 @@ def pretrain(
     """
     config = config or TrainConfig()
     check_dataset(dataset, "dataset", spec)
-    sizes = network_config(spec, **{"dropout": 0.0, **network})
+    sizes = network_config(spec, **{**RECIPE_NETWORK, **network})
     mesh = device_mesh(largest_divisor(config.part_size, len(jax.devices())))
     trainer = Trainer(config, sizes, dataset, mesh)
     state = trainer.init()

@@ -11,6 +11,8 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from envs.drawing import INK
+from envs.errors import UsageError
+from mgpo_jax import methods
 
 STYLE: dict[Any, Any] = {
     "figure.dpi": 150,
@@ -45,13 +47,24 @@ class Look(NamedTuple):
     marker: str
 
 
+def title_of(method: str) -> str:
+    """What legends call a method, by its name or place; the name itself for one that is not known."""
+    try:
+        return methods.find(method).title or method
+    except UsageError:
+        return method
+
+
 METHODS = {
-    "ucb": Look("MGPO-UCB", "#D55E00", "-", "o"),
-    "bpe": Look("MGPO-BPE", "#0072B2", "-", "s"),
-    "explore": Look("MGPO-explore", "#009E73", "-", "^"),
-    "grips": Look("GRIPS", "#CC79A7", "--", "D"),
-    "bbt": Look("BBT", "#56B4E9", "--", "v"),
-    "gcbc": Look("GC-BC", "#6B6B6B", ":", "P"),
+    name: Look(title_of(name), *look)
+    for name, look in {
+        "ucb": ("#D55E00", "-", "o"),
+        "bpe": ("#0072B2", "-", "s"),
+        "explore": ("#009E73", "-", "^"),
+        "grips": ("#CC79A7", "--", "D"),
+        "bbt": ("#56B4E9", "--", "v"),
+        "gcbc": ("#6B6B6B", ":", "P"),
+    }.items()
 }
 # For methods without a look of their own: all colors with solid lines, then all with dashed ones.
 SPARE_COLORS = ("#E69F00", "#8C510A", "#5E3C99", "#B2182B", "#003C30", "#35978F")
@@ -82,7 +95,7 @@ def method_styles(labels: Iterable[str]) -> dict[str, Look]:
     spare = cycle(SPARE_STYLES)
     for label in labels:
         method, _, remark = label.partition(" ")
-        look = METHODS.get(method, Look(method, "", "", ""))
+        look = METHODS.get(method) or Look(title_of(method), "", "", "")
         if look.color in taken or not look.color:
             look = Look(look.name, *next(spare))
         taken.add(look.color)

@@ -19,10 +19,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import envs
-from envs.base import Environment, Task
+from envs.base import Environment, Episode, Task
+from envs.episodes import replay
 from envs.errors import DataError
 from experiments.store.provenance import provenance
 from mgpo_jax.files import load_arrays, new_folder, read_object, write_json
@@ -50,6 +52,7 @@ AXES = {
     "eval_returns": "SNC",
     "optimal_returns": "N",
     "task_goals": "NG",
+    "lengths": "SNE",
     "keys": "SNE2",
     "actions": "SNET*",
     "reached_counts": "SNE",
@@ -84,6 +87,8 @@ class Results:
     """[S, N, C] mean returns of the judging episodes."""
     optimal_returns: np.ndarray
     """[N]; NaN where the optimum is unknown."""
+    lengths: np.ndarray | None = None
+    """[S, N, E] steps of the episodes."""
     keys: np.ndarray | None = None
     """[S, N, E, 2] raw random keys of the episodes in a world of chance, from which their starts follow
     (``envs.episodes.replay``)."""
@@ -134,6 +139,44 @@ class Results:
         where = (seed, task, last - 1)
         return self.best["prompt.goals"][where][self.best["prompt.mask"][where]]
 
+    def reached_in(self, seed: int, task: int, episode: int) -> tuple[np.ndarray, np.ndarray]:
+        """The steps [n] and goals [n, G] that one episode of the search reached.
+
+        Raises:
+          DataError: if the results do not hold them.
+        """
+        if self.reached is None:
+            raise DataError("these results were made before reached goals were kept; adapt again")
+        counts = self.reached.counts
+        end = int(
+            counts.ravel()[: np.ravel_multi_index((seed, task, episode), counts.shape) + 1].sum()
+        )
+        rows = slice(end - int(counts[seed, task, episode]), end)
+        return self.reached.steps[rows], self.reached.goals[rows]
+
+    def replay(self, seed: int, task: int, episode: int) -> Episode:
+        """Play one episode of the search again.
+
+        Raises:
+          DataError: if the results do not hold its actions.
+        """
+        if self.actions is None:
+            raise DataError(
+                "these results hold no actions; adapt again, with --keep-actions where they are continuous"
+            )
+        where = (seed, task, episode)
+        env, actions = envs.make(self.env), self.actions[where]
+        if self.lengths is not None:
+            length = int(self.lengths[where])
+        else:  # the largest number of the type stands after the end
+            length = int((actions != np.iinfo(actions.dtype).max).sum())
+        raw = np.zeros(2, np.uint32) if self.keys is None else self.keys[where]
+        played = jnp.asarray(actions, env.spec.zero_action().dtype)
+        one = jax.tree.map(jnp.asarray, self.task(task))
+        return replay(
+            jax.random.wrap_key_data(jnp.asarray(raw)), env, one, played, jnp.int32(length)
+        )
+
     def most_improved(self, num: int = 4) -> list[int]:
         """The tasks whose return adaptation raised most, over all seeds, the largest gain first."""
         gains = (self.eval_returns[:, :, -1] - self.eval_returns[:, :, 0]).mean(axis=0)
@@ -156,6 +199,7 @@ def results_of(
         eval_episodes=outcome.eval_episodes,
         eval_returns=outcome.eval_returns,
         optimal_returns=optimum,
+        lengths=outcome.lengths,
         keys=None if env.spec.deterministic else outcome.keys,
         actions=outcome.actions,
         reached=outcome.reached,
@@ -178,6 +222,8 @@ def save_results(folder: Path, results: Results) -> None:
     }
     if results.optimum_known:
         arrays["optimal_returns"] = results.optimal_returns
+    if results.lengths is not None:
+        arrays["lengths"] = results.lengths.astype(np.min_scalar_type(results.lengths.max()))
     if results.keys is not None:
         arrays["keys"] = results.keys
     if results.actions is not None:
@@ -239,6 +285,7 @@ def load_results(folder: Path) -> Results:
         eval_episodes=arrays["eval_episodes"],
         eval_returns=arrays["eval_returns"],
         optimal_returns=arrays.get("optimal_returns", np.full(sizes["N"], np.nan)),
+        lengths=arrays.get("lengths"),
         keys=arrays.get("keys"),
         actions=arrays.get("actions"),
         reached=_expand(arrays, where),
@@ -282,7 +329,9 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], where: Path) -> dict[str, in
 
 def _expected_parts(arrays: Mapping[str, np.ndarray]) -> list[str]:
     """Names of the parts of choices: who acted and the best choice have the same ones."""
-    parts = {*_with_prefix(arrays, "choice."), *_with_prefix(arrays, "best.")} or {"*"}
+    parts = {*_with_prefix(arrays, "choice."), *_with_prefix(arrays, "best.")}
+    if not parts and "task_goals" not in arrays:  # format 1, in which every choice is a prompt
+        parts = {"*"}
     expected = [f"{prefix}{part}" for prefix in ("choice.", "best.") for part in sorted(parts)]
     return [name for name in expected if name != "best.greedy"]  # which format 1 did not keep
 

@@ -19,7 +19,7 @@ import tyro
 import envs
 from envs.errors import UsageError, nearest
 from experiments.runtime import Common, early_values
-from mgpo_jax.settings import TrainConfig, number
+from mgpo_jax.settings import RECIPE_NETWORK, TrainConfig, number
 
 RUNS = Path("runs")
 DEFAULT_WORLD = "maze15"
@@ -80,7 +80,7 @@ class PretrainConfig(Common):
     train: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
     max_prompt_length: int = number(5, at_least=1)
     """K, the longest prompt [5]."""
-    dropout: float = number(0.0, at_least=0)
+    dropout: float = number(RECIPE_NETWORK["dropout"], at_least=0)
     """Dropout rate [0.1]."""
     prompt_order: bool = True
     """Give prompt goals a position embedding [False]."""
@@ -88,13 +88,13 @@ class PretrainConfig(Common):
     """Width of the network [128]."""
     num_layers: int = number(3, at_least=1)
     """Transformer blocks [3]."""
-    num_heads: int = number(4, at_least=1)
+    num_heads: int = number(RECIPE_NETWORK["num_heads"], at_least=1)
     """Attention heads [1]."""
     encoder: str = "linear"
     """How observations become tokens [linear]."""
     head: str | None = None
-    """Distribution of continuous actions: gaussian, mixture, binned or fixed_gaussian (default: the
-    world's) [fixed_gaussian in the authors' code]."""
+    """Distribution of continuous actions: gaussian, mixture, binned or fixed_gaussian (default: that of
+    the preset, else gaussian) [fixed_gaussian in the authors' code]."""
     standardize_obs: bool = False
     """Standardize observations by their mean and spread in the dataset [False]."""
     holdout: int = number(200, at_least=1)
@@ -178,10 +178,13 @@ def pretrain_preset(env: str, preset: str) -> PretrainConfig:
     if preset not in PRESETS:
         raise nearest(preset, PRESETS, "preset")
     config = PretrainConfig(env=env, preset=preset)
-    # A preset that the world does not know starts from the fast one.
-    own = world.presets.get(preset, world.presets.get("fast", {}))
-    config = with_settings(with_settings(config, own), PRESETS[preset])
-    if preset == "smoke":  # few padded lengths, so that little is compiled
+    if preset not in world.presets:  # it starts from the world's fast one
+        config = with_settings(config, world.presets.get("fast", {}))
+    config = with_settings(config, PRESETS[preset])
+    config = with_settings(config, world.presets.get(preset, {}))
+    if (
+        preset == "smoke" and preset not in world.presets
+    ):  # few padded lengths, so that little is compiled
         config = with_settings(config, {"bucket": 8 * config.train.bucket})
     return config
 

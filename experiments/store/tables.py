@@ -1,4 +1,4 @@
-"""Tables: one function lays out all of them, for the terminal and for Markdown."""
+"""Tables of commands: one function lays them out, for the terminal and for Markdown."""
 
 from __future__ import annotations
 

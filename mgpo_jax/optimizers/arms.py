@@ -151,6 +151,7 @@ class BanditState(NamedTuple):
 Select = Callable[[PRNGKeyArray, BanditState], Int[Array, ""]]
 
 
+# Long because the four functions of an optimizer share its settings and are read together.
 def bandit(space: SearchSpace, select: Select, act_with_newest: bool = False) -> PromptOptimizer:
     """Algorithm 1 with ``select(key, state) -> arm``.
 

@@ -44,6 +44,7 @@ class BbtState(NamedTuple):
     episode: Int[Array, ""]
 
 
+# Long because the four functions of an optimizer share its settings and are read together.
 def bbt(
     space: SearchSpace,
     population_size: int = 10,

@@ -44,12 +44,10 @@ def prompt_adapter(
       judged: how the best prompt is judged (default: greedily).
     """
     judged = judged or Judgement()
-    sampled = judged.mode == "sample"
-    tempered = sampled and judged.temperature != 1
 
     def ask(key: PRNGKeyArray, state: Any) -> tuple[Query, Any]:
         query, state = optimizer.ask(key, state)
-        return query._replace(temperature=jnp.ones(()) if tempered else None), state
+        return query._replace(temperature=jnp.ones(()) if judged.tempered else None), state
 
     def agent(state: Any, query: Query) -> Agent:
         del state
@@ -67,10 +65,9 @@ def prompt_adapter(
 
 def judged_query(prompt: Prompt, judged: Judgement) -> Query:
     """How a prompt is judged."""
-    sampled = judged.mode == "sample"
-    tempered = sampled and judged.temperature != 1
-    temperature = jnp.float32(judged.temperature) if tempered else None
-    return Query(prompt, jnp.full(prompt.mask.shape[:-1], not sampled), temperature)
+    temperature = jnp.float32(judged.temperature) if judged.tempered else None
+    greedy = jnp.full(prompt.mask.shape[:-1], judged.mode == "greedy")
+    return Query(prompt, greedy, temperature)
 
 
 def fixed_prompt(num_slots: int) -> PromptOptimizer:
