@@ -25,7 +25,8 @@ WORLD_FOLDERS = sorted(
 )
 # Where a world may be named: the default of --env.
 MAY_NAME = {"experiments.store.settings": {"maze15"}}
-DEVICES, MAY_MOVE = {"device_get", "device_put", "addressable_shards"}, "mgpo_jax.sharding"
+DEVICES = {"device_get", "device_put", "addressable_shards", "shard_map", "NamedSharding"}
+MAY_MOVE = "mgpo_jax.sharding"
 LONG, MAX_LONG = 60, 3  # lines of a long function, and how many of them there may be
 COMMAND_LINES = 150
 

@@ -1,4 +1,4 @@
-"""The published results: every kept episode can be played again, and folders of the first format are read."""
+"""The published results: their episodes can be played again, and folders of the first format are read."""
 
 from __future__ import annotations
 
@@ -48,27 +48,21 @@ def test_published_episodes_can_be_played_again(name):
 @pytest.mark.parametrize("name", ["maze15/ucb", "gridworld/ucb"])
 def test_reached_goals_are_those_of_the_replayed_episodes(name):
     results = load_results(RESULTS / name)
-    env = envs.make(results.env)
     reached = results.reached
     ends = np.cumsum(reached.counts.ravel()).reshape(reached.counts.shape)
     assert ends[-1, -1, -1] == len(reached.steps) == len(reached.goals)
     for where in [(0, 0, 0), (1, 7, 13), (2, 49, 99)]:
-        actions = jnp.asarray(results.actions[where], jnp.int32)
-        key = jax.random.key(0)
-        if results.keys is not None:
-            key = jax.random.wrap_key_data(jnp.asarray(results.keys[where]))
-        length = jnp.sum(actions != 255)
-        task = jax.tree.map(jnp.asarray, results.task(where[1]))
-        episode = replay(key, env, task, actions, length)
-        steps = np.flatnonzero(episode.trajectory.goal_reached)
-        rows = slice(ends[where] - reached.counts[where], ends[where])
-        np.testing.assert_array_equal(reached.steps[rows], steps)
-        np.testing.assert_array_equal(reached.goals[rows], episode.trajectory.achieved_goals[steps])
+        episode = results.replay(*where)
+        assert episode.return_ == pytest.approx(results.returns[where], abs=1e-5)
+        steps, goals = results.reached_in(*where)
+        np.testing.assert_array_equal(steps, np.flatnonzero(episode.trajectory.goal_reached))
+        np.testing.assert_array_equal(goals, episode.trajectory.achieved_goals[steps])
 
 
 def test_results_of_the_first_format_are_read():
     results = load_results(RESULTS / "kitchen" / "ucb")
     assert results.method == "ucb"
-    assert results.actions is None and results.reached is None
+    assert results.actions is None
+    assert results.reached is None
     assert results.best_goals(0, 0).shape[1] == results.task_goals.shape[1] == 5
     assert set(results.choices) == {"prompt.goals", "prompt.mask", "greedy"}
