@@ -88,8 +88,9 @@ def run(
     try:
         values = {} if default is None else {"default": default(words)}
         parsed: Any = tyro.conf.OmitArgPrefixes[config_class]
-        name = f"python -m {main.__globals__['__spec__'].name}"
-        config = tyro.cli(parsed, prog=name, args=words, description=main.__doc__, **values)
+        config = tyro.cli(
+            parsed, prog=program_name(), args=words, description=main.__doc__, **values
+        )
         check_settings(config)
         configure()
         main(config)
@@ -101,6 +102,14 @@ def run(
         text = f"{type(error).__name__}: {error}".splitlines()[0]
         _fail(f"{text} (run with --debug for the traceback)", EXIT_FAILED, debug)
     sys.exit(0)
+
+
+def program_name() -> str:
+    """How the process was called, for usage messages."""
+    stem = Path(sys.argv[0]).stem
+    if stem in ("mgpo", "__main__"):
+        return " ".join(["mgpo", *sys.argv[1:2]])
+    return f"python -m experiments.{stem}"
 
 
 def _fail(message: str, code: int, debug: bool) -> NoReturn:

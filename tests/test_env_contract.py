@@ -264,10 +264,10 @@ def test_records(name):
     assert world.summary
     known = world.demonstrators(world.make())
     assert all(isinstance(one, envs.Demonstrator) for one in known.values())
-    assert set(world.presets) == {"fast", "paper"}
+    assert {"fast", "paper"} <= set(world.presets) <= {"fast", "paper", "ablation"}
     for settings in world.presets.values():
         assert settings["steps"] > 0
-        assert settings["episodes"] > 0
+        assert settings["trajectories"] > 0
         assert settings.get("demonstrator") in {None, *known}
     assert (world.judged.episodes > 1) == (not world.make().spec.deterministic)
     if world.policy_of is not None:
@@ -398,7 +398,8 @@ class TestRegistry:
 
     @pytest.fixture(autouse=True)
     def _copy(self, monkeypatch, tmp_path):
-        monkeypatch.setattr(WORLDS, "_records", dict(WORLDS._records))
+        monkeypatch.setattr(WORLDS, "_registered", dict(WORLDS._registered))
+        monkeypatch.setattr(WORLDS, "_loaded", dict(WORLDS._loaded))
         monkeypatch.setattr(sys, "path", [*sys.path])
         monkeypatch.chdir(tmp_path)
 
@@ -418,15 +419,15 @@ class TestRegistry:
                 envs.register(envs.World(name=name, make=lambda: Bare(4)))
 
     def test_a_world_of_a_file_here(self, tmp_path):
-        (tmp_path / "own_world.py").write_text(
+        (tmp_path / "world_file_here.py").write_text(
             "import envs\nWORLD = envs.World(name='own', make=lambda: envs.make('maze15'))\nNO = 3"
         )
-        assert envs.find("own_world:WORLD").name == "own"
-        assert envs.make("own_world:WORLD") == envs.make("maze15")
-        with pytest.raises(UsageError, match="own_world:NO is a int, not a World record"):
-            envs.find("own_world:NO")
-        with pytest.raises(UsageError, match="cannot load the world 'own_world:OTHER'"):
-            envs.find("own_world:OTHER")
+        assert envs.find("world_file_here:WORLD").name == "own"
+        assert envs.make("world_file_here:WORLD") == envs.make("maze15")
+        with pytest.raises(UsageError, match="world_file_here:NO is a int, not a World record"):
+            envs.find("world_file_here:NO")
+        with pytest.raises(UsageError, match="cannot load the world 'world_file_here:OTHER'"):
+            envs.find("world_file_here:OTHER")
         with pytest.raises(UsageError, match="cannot load the world 'nowhere:WORLD'"):
             envs.find("nowhere:WORLD")
 

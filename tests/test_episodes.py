@@ -183,7 +183,7 @@ def test_memory_grows_to_the_length_of_the_episode():
 
 
 @pytest.mark.parametrize(
-    ("horizon", "num"), [(1, 1), (31, 1), (32, 2), (90, 5), (500, MAX_SEGMENTS)]
+    ("horizon", "num"), [(1, 1), (32, 1), (64, 2), (90, 2), (255, 7), (500, MAX_SEGMENTS)]
 )
 def test_segments(horizon, num):
     assert num_segments(horizon) == num
