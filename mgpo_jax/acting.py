@@ -35,7 +35,7 @@ class Actor:
 
     It remembers the episode, so observations are given one at a time and in order:
 
-        actor = Actor(load_policy("maze15"), goals)
+        actor = Actor(load_policy(world), goals)
         action = actor.reset(obs)
         while not done:
             obs, done = step_the_world(action)

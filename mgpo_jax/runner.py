@@ -198,7 +198,8 @@ def sweep(
     program = _program(method, setting, fixed, layout, max(segments), keep_actions)
     lanes = split(layout.mesh, grid.lanes(layout, tasks, seed, numbers))
     params = replicate(layout.mesh, policy.params)
-    record, cpu = _run(program, lanes, params, segments, grid)
+    per_round = adapter.episodes_per_round * grid.size
+    record, cpu = _run(program, lanes, params, segments, per_round)
     per_lane = episodes + (len(segments) + 1) * setting.judged.episodes
     # The search, too, begins with one evaluation of the initial choice.
     after = np.concatenate([[1], np.cumsum(segments) * adapter.episodes_per_round])
@@ -340,7 +341,6 @@ class Programs(NamedTuple):
     """``(lanes, params) -> state``."""
     advance: Program
     """``((state, lanes), (params, number of rounds, number of the judgement)) -> (state, log, judged)``."""
-    num_judged: int
 
 
 @cache
@@ -377,7 +377,6 @@ def _program(
     return Programs(
         Program(_over_lanes(env, layout, begin)),
         Program(_over_lanes(env, layout, advance)),
-        setting.judged.episodes,
     )
 
 
@@ -421,26 +420,24 @@ class Record(NamedTuple):
 
 
 def _run(
-    programs: Programs, lanes: Lanes, params: Any, segments: Sequence[int], grid: Grid
+    programs: Programs, lanes: Lanes, params: Any, segments: Sequence[int], per_round: int
 ) -> tuple[Record, float]:
     """Run all segments of an adaptation, each followed by a judgement; the first judgement comes before.
 
-    The second result is the CPU time that it took, without compilation.
+    ``per_round`` is the number of episodes that all lanes together run in a round. The second result is
+    the CPU time that it took, without compilation.
     """
     state = programs.start.compile(lanes, params)(lanes, params)
     logs: list[AdaptLog] = []
     judgements: list[Judged] = []
     advance = programs.advance.compile((state, lanes), (params, jnp.int32(0), jnp.int32(0)))
     cpu = time.process_time()
-
-    with tqdm(total=1, unit="episode", disable=None) as progress:
+    with tqdm(total=sum(segments) * per_round, unit="episode", disable=None) as progress:
         for number, num_rounds in enumerate([0, *segments]):
             shared = (params, jnp.int32(num_rounds), jnp.int32(number))
             state, log, judged = advance((state, lanes), shared)
             judgements.append(fetch(judged))
             log = jax.tree.map(lambda rows, n=num_rounds: rows[:, :n], fetch(log))
-            per_round = log.returns.shape[-1] * grid.size
-            progress.total = sum(segments) * per_round
             progress.update(num_rounds * per_round)
             if num_rounds:
                 logs.append(log)
