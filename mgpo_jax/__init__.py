@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from mgpo_jax.prompts import Prompt, goals_of, prompt_of, sample_prompt, single_goal
     from mgpo_jax.rollout import Query, prompted
     from mgpo_jax.runner import Outcome, adapt, evaluate, play, sweep
-    from mgpo_jax.settings import TrainConfig, number
+    from mgpo_jax.settings import TrainConfig, static
     from mgpo_jax.tasks import load_tasks, sample_tasks, save_tasks, test_tasks
     from mgpo_jax.training import pretrain
 
@@ -64,7 +64,7 @@ _PLACES = {
     "mgpo_jax.prompts": ("Prompt", "goals_of", "prompt_of", "sample_prompt", "single_goal"),
     "mgpo_jax.rollout": ("Query", "prompted"),
     "mgpo_jax.runner": ("Outcome", "adapt", "evaluate", "play", "sweep"),
-    "mgpo_jax.settings": ("TrainConfig", "number"),
+    "mgpo_jax.settings": ("TrainConfig", "static"),
     "mgpo_jax.tasks": ("load_tasks", "sample_tasks", "save_tasks", "test_tasks"),
     "mgpo_jax.training": ("pretrain",),
 }  # fmt: skip

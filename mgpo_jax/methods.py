@@ -11,11 +11,19 @@ import dataclasses
 import importlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from annotated_types import Ge, Gt, Le
 
 from envs.errors import UsageError
 from envs.registry import Judgement, Registry
-from mgpo_jax.settings import check_settings, number
+from mgpo_jax.settings import (
+    NotNegative,
+    NumGoals,
+    Positive,
+    check_settings,
+    static,
+)
 
 if TYPE_CHECKING:
     from envs.base import Environment
@@ -146,7 +154,7 @@ def with_numbers(hyper: Any, numbers: Mapping[str, Any]) -> Any:
 class PromptHyper:
     """Hyper-parameters of every method that searches prompts. Values in brackets are the paper's."""
 
-    max_goals: int | None = number(None, at_least=1)
+    max_goals: NumGoals | None = None
     """K, the longest prompt to try (default: the longest that the policy was trained with) [5]."""
 
 
@@ -163,9 +171,9 @@ class ExploreHyper(PromptHyper):
 class UcbHyper(ExploreHyper):
     """Hyper-parameters of Algorithm 1 with upper confidence bounds (Eq. 3)."""
 
-    c: float = number(1.0, at_least=0)
+    c: NotNegative = 1.0
     """Exploration constant [1]."""
-    scale: float | None = number(None, above=0)
+    scale: Positive | None = None
     """Unit of returns in which c counts; 1 is Eq. 3 as printed (default: the span of the world's
     returns)."""
 
@@ -174,7 +182,7 @@ class UcbHyper(ExploreHyper):
 class BpeHyper(ExploreHyper):
     """Hyper-parameters of Algorithm 1 with Bayesian posterior estimation (Eq. 4)."""
 
-    min_std: float = number(0.02, above=0)
+    min_std: Annotated[float, Gt(0), Le(1)] = 0.02
     """Smallest spread of a prompt's returns, as a share of the prior's."""
 
 
@@ -182,7 +190,7 @@ class BpeHyper(ExploreHyper):
 class GripsHyper(PromptHyper):
     """Hyper-parameters of Algorithm 2."""
 
-    num_edits: int = number(5, at_least=1)
+    num_edits: Annotated[int, Ge(1), Le(4_096)] = 5
     """Edited prompts in an iteration [5]."""
 
 
@@ -190,11 +198,11 @@ class GripsHyper(PromptHyper):
 class BbtHyper(PromptHyper):
     """Hyper-parameters of Algorithm 3."""
 
-    population_size: int = number(10, at_least=2, static=True)
+    population_size: Annotated[int, Ge(2), Le(4_096)] = static(10)
     """Population of CMA-ES [10]."""
-    latent_dim: int = number(5, at_least=1, static=True)
+    latent_dim: Annotated[int, Ge(1), Le(4_096)] = static(5)
     """Size of z."""
-    std_init: float = number(0.5, above=0)
+    std_init: Positive = 0.5
     """Initial step size, in units of goals."""
 
 

@@ -1,38 +1,54 @@
-"""Settings as frozen dataclasses, with the bounds of their numbers. Nothing here imports jax.
+"""Settings as frozen dataclasses, with the ranges of their values. Nothing here imports jax.
 
-A setting is a field with a docstring, from which its flag and help text are made. ``number`` adds bounds,
-which ``check_settings`` enforces for command lines and library calls alike.
+A setting is a field with a type and a docstring. Its flag, its help text and its check come from this one
+declaration: the docstring says what it is and in which unit it counts, and the type holds the range, such
+as ``Count`` or ``Annotated[float, Gt(0)]``. ``check_settings`` serves command lines and library calls.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from functools import cache
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
-from envs.errors import UsageError
+from annotated_types import Ge, Gt, Le, Lt, MinLen
+from pydantic import PydanticUserError
+
+from envs.errors import UsageError, nearest
+from mgpo_jax.schema import LIMITS, fault
+
+# Numbers enter programs with 32 bits. Sizes have upper bounds where more could only fill the memory.
+Count = Annotated[int, Ge(1), Lt(2**31)]
+Index = Annotated[int, Ge(0), Lt(2**31)]
+Seed = Annotated[int, Ge(0), Lt(2**32)]
+Positive = Annotated[float, Gt(0), Le(1e9)]
+NotNegative = Annotated[float, Ge(0), Le(1e9)]
+Share = Annotated[float, Ge(0), Lt(1)]
+Name = Annotated[str, MinLen(1)]
+
+NumTrajectories = Annotated[int, Ge(1), Le(10_000_000)]
+NumEpisodes = Annotated[int, Ge(1), Le(100_000)]
+NumTasks = Annotated[int, Ge(1), Le(10_000)]
+NumSeeds = Annotated[int, Ge(1), Le(10_000)]
+NumGoals = Annotated[int, Ge(1), Le(4_096)]
+BatchSize = Annotated[int, Ge(1), Le(65_536)]
+Width = Annotated[int, Ge(1), Le(16_384)]
+NumLayers = Annotated[int, Ge(1), Le(256)]
+
+Encoder = Literal["linear"]
+"""The names in ``encoders.ENCODERS``, which need jax."""
+Head = Literal["categorical", "gaussian", "fixed_gaussian", "mixture", "binned"]
+"""The names in ``distributions.HEADS``, which need jax."""
 
 
-def number(
-    default: Any,
-    *,
-    at_least: int | float | None = None,
-    above: int | float | None = None,
-    static: bool = False,
-) -> Any:
-    """A field of a settings dataclass with bounds.
+def static(default: Any) -> Any:
+    """A field whose value decides about shapes, so that each value needs a program of its own.
 
-    Args:
-      default: its default value; None means that there is a default elsewhere, and is always accepted.
-      at_least: smallest value.
-      above: largest value that is too small.
-      static: whether the value decides about shapes, so that each value needs a program of its own.
-        Other numbers enter programs as data.
+    Other numbers among the hyper-parameters of a method enter its program as data.
     """
-    return dataclasses.field(
-        default=default, metadata={"at_least": at_least, "above": above, "static": static}
-    )
+    return dataclasses.field(default=default, metadata={"static": True})
 
 
 def flag(name: str) -> str:
@@ -40,21 +56,66 @@ def flag(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
+@cache
+def types_of(settings_class: type) -> dict[str, Any]:
+    """The types of the settings of a dataclass, with their ranges."""
+    try:
+        return get_type_hints(settings_class, include_extras=True)
+    except NameError:  # a type of a user that only a type checker imports
+        return {}
+
+
 def check_settings(settings: Any) -> None:
-    """Raise ``UsageError`` for the first number of a settings dataclass that is out of its bounds."""
-    for field in dataclasses.fields(settings):
-        value = getattr(settings, field.name)
-        if dataclasses.is_dataclass(value):
+    """Raise ``UsageError`` for the first setting of a dataclass that is not what its type allows."""
+    values = {field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)}
+    check_values(type(settings), values)
+    for value in values.values():
+        if is_settings(value):
             check_settings(value)
-        if not isinstance(value, int | float) or isinstance(value, bool):
+
+
+def check_values(settings_class: type, values: Mapping[str, Any]) -> None:
+    """The same for values that a dataclass is to be made of, but for other dataclasses among them."""
+    known = types_of(settings_class)
+    for name, value in values.items():
+        annotation = known.get(name, type(value))
+        if is_settings(value) or not (said := setting_fault(annotation, value)):
             continue
-        low, above = field.metadata.get("at_least"), field.metadata.get("above")
-        if not math.isfinite(value):
-            raise UsageError(f"{flag(field.name)} must be a finite number, found {value}")
-        if low is not None and value < low:
-            raise UsageError(f"{flag(field.name)} must be at least {low}, found {value}")
-        if above is not None and value <= above:
-            raise UsageError(f"{flag(field.name)} must be above {above}, found {value}")
+        choices = [part for part in get_parts(annotation) if get_origin(part) is Literal]
+        if choices and isinstance(value, str):
+            raise nearest(value, get_args(choices[0]), flag(name))
+        raise UsageError(f"{flag(name)} {said}")
+
+
+def is_settings(value: Any) -> bool:
+    """Whether a value is a dataclass, and no class."""
+    return dataclasses.is_dataclass(value) and not isinstance(value, type)
+
+
+def setting_fault(annotation: Any, value: Any) -> str | None:
+    """What is wrong with the value of a setting, as the end of a sentence; None if nothing is."""
+    try:
+        return fault(annotation, value)
+    except PydanticUserError:  # a type of a user that pydantic does not know
+        return None
+
+
+def get_parts(annotation: Any) -> Iterator[Any]:
+    """A type and the types that it is made of."""
+    yield annotation
+    if get_origin(annotation) is not Literal:
+        for part in get_args(annotation):
+            yield from get_parts(part)
+
+
+def range_of(annotation: Any) -> str:
+    """The range of a setting in words, such as "at least 1"; empty where it has none."""
+    limits = [part for part in get_parts(annotation) if isinstance(part, Gt | Ge | Lt | Le)]
+    return ", ".join(
+        f"{LIMITS[name]} {value:.12g}"
+        for limit in limits
+        for name, value in dataclasses.asdict(limit).items()
+    )
 
 
 RECIPE_NETWORK: dict[str, Any] = {"dropout": 0.0, "num_heads": 4}
@@ -65,30 +126,30 @@ RECIPE_NETWORK: dict[str, Any] = {"dropout": 0.0, "num_heads": 4}
 class TrainConfig:
     """How to train. Values in brackets are the paper's (Table 6) or, marked *, its code's."""
 
-    steps: int = number(24_000, at_least=1)
+    steps: Count = 24_000
     """Gradient steps [50,000* to 200,000*, depending on the world]."""
-    batch_size: int = number(64, at_least=1)
+    batch_size: BatchSize = 64
     """Trajectories in a gradient step [64]."""
     optimizer: Literal["muon", "adamw"] = "muon"
     """Muon on the matrices of the blocks and AdamW on the rest, or AdamW alone [adamw]."""
-    learning_rate: float = number(3e-3, above=0)
+    learning_rate: Annotated[float, Gt(0), Le(100)] = 3e-3
     """Peak learning rate [1e-4]."""
-    warmup_steps: int = number(300, at_least=0)
-    """Steps of linear warm-up [10,000]."""
+    warmup_steps: Index = 300
+    """Steps of linear warm-up, of which a shorter training has as many as it can [10,000]."""
     schedule: Literal["cosine", "constant"] = "cosine"
     """Decay after warm-up: to 2 % along a cosine, or none [constant*]."""
-    weight_decay: float = number(1e-4, at_least=0)
+    weight_decay: Annotated[float, Ge(0), Le(1_000)] = 1e-4
     """Weight decay [1e-4]."""
-    clip_norm: float = number(1.0, above=0)
+    clip_norm: Positive = 1.0
     """Largest global norm of the gradient [0.25*]."""
-    obs_noise: float = number(0.0, at_least=0)
+    obs_noise: NotNegative = 0.0
     """Largest standard deviation of the Gaussian noise that training adds to observations, in their
     units [0]."""
-    part_size: int = number(16, at_least=1)
+    part_size: BatchSize = 16
     """Trajectories computed at once, over all devices. It changes speed and memory, not the sum."""
-    part_steps: int = number(1024, at_least=1)
+    part_steps: Count = 1024
     """Parts with more padded steps than this are halved, so that they fit into a core's cache."""
-    bucket: int = number(4, at_least=1)
+    bucket: BatchSize = 4
     """Padded lengths are multiples of this many steps."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the initial weights, batches, prompts and dropout."""

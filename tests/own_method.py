@@ -8,13 +8,13 @@ import jax.numpy as jnp
 from mgpo_jax import Adapter, LoadedPolicy, Method, Query, sample_prompt
 from mgpo_jax.prompts import single_goal
 from mgpo_jax.rollout import prompted
-from mgpo_jax.settings import number
+from mgpo_jax.settings import Count, NotNegative
 
 
 @dataclass(frozen=True)
 class LuckyHyper:
-    longest: int = number(3, at_least=1)  # Goals of the longest prompt to draw.
-    thrift: float = number(0.0, at_least=0)  # How much better a prompt must be to be kept.
+    longest: Count = 3  # Goals of the longest prompt to draw.
+    thrift: NotNegative = 0.0  # How much better a prompt must be to be kept.
 
 
 def make_lucky(setting, params, hyper):

@@ -37,7 +37,7 @@ from mgpo_jax.methods import (
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.prompts import Prompt
 from mgpo_jax.runner import adapt, sweep
-from mgpo_jax.settings import number
+from mgpo_jax.settings import Count, static
 from mgpo_jax.tasks import sample_tasks
 from mgpo_jax.transformer import GoalTransformer, network_config
 
@@ -85,12 +85,12 @@ def test_a_name_that_is_nearly_right(name, near):
 MODULE = """
 from dataclasses import dataclass
 from mgpo_jax.methods import Method
-from mgpo_jax.settings import number
+from mgpo_jax.settings import Count, Positive
 
 @dataclass(frozen=True)
 class Hyper:
-    rate: float = number(0.1, above=0)
-    num_edits: int = number(1, at_least=1)
+    rate: Positive = 0.1
+    num_edits: Count = 1
 
 def make(setting, params, hyper):
     from mgpo_jax.methods import GCBC, NoHyper
@@ -276,7 +276,7 @@ def test_adapters_are_checked_before_anything_runs(policy):
 
     @dataclass(frozen=True)
     class Hyper:
-        size: int = number(1, at_least=1, static=True)
+        size: Count = static(1)
 
     def check(setting, hyper):
         assert setting.num_episodes == 3

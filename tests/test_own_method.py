@@ -66,13 +66,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def adapt(folder: Path, capsys: pytest.CaptureFixture[str]) -> Run:
     """Adapts with the method as a command line says."""
     command = importlib.import_module("experiments.adapt").command
-    words = (
-        "--env own_world:WORLD --policy policy --method own_method:METHOD --seeds 1 --episodes 5"
-    )
+    words = "--env own_world:WORLD --policy policy --seeds 1 --episodes 5"
 
     def call(line: str) -> Done:
+        method = "" if "--method" in line else "--method own_method:METHOD"
         with pytest.raises(SystemExit) as stop:
-            command([*words.split(), *line.split()])
+            command(f"{words} {method} {line}".split())
         return Done(int(stop.value.code or 0), *capsys.readouterr())
 
     return call
@@ -94,8 +93,10 @@ def test_its_settings_are_in_the_help(adapt: Run) -> None:
     done = adapt("--help")
     assert done.code == 0
     text = " ".join(done.out.replace("│", " ").split())
-    assert "--longest INT Goals of the longest prompt to draw. (default: 3)" in text
-    assert "--thrift FLOAT How much better a prompt must be to be kept. (default: 0.0)" in text
+    longest = "--longest INT Goals of the longest prompt to draw."
+    assert f"{longest} (at least 1, below 2147483648; default: 3)" in text
+    thrift = "--thrift FLOAT How much better a prompt must be to be kept."
+    assert f"{thrift} (at least 0, at most 1000000000; default: 0.0)" in text
     assert "--keep-rewarded" not in text
 
 
@@ -105,7 +106,7 @@ def test_its_settings_are_in_the_help(adapt: Run) -> None:
         ("--longest 0", "--longest must be at least 1, found 0"),
         ("--thrift -1", "--thrift must be at least 0, found -1"),
         ("--thrift inf", "--thrift must be a finite number, found inf"),
-        ("--thrift much", "much"),
+        ("--thrift much", "--thrift must be a number, found 'much'"),
         ("--c 2", "--c is no setting of lucky; it is one of ucb"),
         ("--keep-rewarded", "is no setting of lucky; it is one of ucb, bpe, explore"),
         ("--method own_method:LuckyHyper", "own_method:LuckyHyper is a type, not a Method record"),

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,9 +17,31 @@ from typing import Annotated, Any
 import tyro
 
 import envs
-from envs.errors import UsageError, nearest
-from experiments.runtime import Common, early_values
-from mgpo_jax.settings import RECIPE_NETWORK, TrainConfig, number
+from envs.errors import DataError, UsageError, nearest, shown
+from experiments.runtime import Common
+from mgpo_jax.methods import NoHyper
+from mgpo_jax.schema import Json, read_document
+from mgpo_jax.settings import (
+    RECIPE_NETWORK,
+    Count,
+    Encoder,
+    Head,
+    Name,
+    NumEpisodes,
+    NumGoals,
+    NumLayers,
+    NumSeeds,
+    NumTasks,
+    NumTrajectories,
+    Seed,
+    Share,
+    TrainConfig,
+    Width,
+    flag,
+    get_parts,
+    setting_fault,
+    types_of,
+)
 
 RUNS = Path("runs")
 DEFAULT_WORLD = "maze15"
@@ -34,18 +56,18 @@ def data_root() -> Path:
 class CollectConfig(Common):
     """Settings of ``experiments.collect``."""
 
-    env: str = DEFAULT_WORLD
+    env: Name = DEFAULT_WORLD
     """The world, by name or as module:attribute (``python -m experiments.list`` shows the names)."""
-    demonstrator: Annotated[str | None, tyro.conf.arg(aliases=("--policy",))] = None
+    demonstrator: Annotated[Name | None, tyro.conf.arg(aliases=("--policy",))] = None
     """Who demonstrates (default: the world's first demonstrator)."""
-    trajectories: Annotated[int, tyro.conf.arg(aliases=("--episodes",))] = number(
-        10_000, at_least=1
-    )
+    trajectories: Annotated[NumTrajectories, tyro.conf.arg(aliases=("--episodes",))] = 10_000
     """Trajectories to keep."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of tasks and demonstrator."""
     out: Path | None = None
     """Folder to write (default: data/ENV/DEMONSTRATOR-TRAJECTORIES-seedSEED, under $MGPO_DATA if set)."""
+    resume: bool = False
+    """Go on with a collection that was stopped; the dataset is the same as without a stop."""
 
 
 def dataset_folder(config: CollectConfig, demonstrator: str) -> Path:
@@ -58,13 +80,11 @@ def dataset_folder(config: CollectConfig, demonstrator: str) -> Path:
 class DataConfig:
     """Which dataset to train on."""
 
-    demonstrator: Annotated[str | None, tyro.conf.arg(aliases=("--policy",))] = None
+    demonstrator: Annotated[Name | None, tyro.conf.arg(aliases=("--policy",))] = None
     """Who collects it (default: the world's first demonstrator)."""
-    trajectories: Annotated[int, tyro.conf.arg(aliases=("--episodes",))] = number(
-        10_000, at_least=1
-    )
+    trajectories: Annotated[NumTrajectories, tyro.conf.arg(aliases=("--episodes",))] = 10_000
     """Trajectories to train on; they are collected first where they are not there yet."""
-    data_seed: int = 0
+    data_seed: Seed = 0
     """Seed of the dataset."""
 
 
@@ -72,38 +92,38 @@ class DataConfig:
 class PretrainConfig(Common):
     """Settings of ``experiments.pretrain``; values in brackets are the paper's."""
 
-    env: str = DEFAULT_WORLD
+    env: Name = DEFAULT_WORLD
     """The world, by name or as module:attribute (``python -m experiments.list`` shows the names)."""
-    preset: str = "fast"
+    preset: Name = "fast"
     """Where the defaults below come from: fast, paper or smoke."""
     data: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
     train: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
-    max_prompt_length: int = number(5, at_least=1)
+    max_prompt_length: NumGoals = 5
     """K, the longest prompt [5]."""
-    dropout: float = number(RECIPE_NETWORK["dropout"], at_least=0)
+    dropout: Share = RECIPE_NETWORK["dropout"]
     """Dropout rate [0.1]."""
     prompt_order: bool = True
     """Give prompt goals a position embedding [False]."""
-    embed_dim: int = number(128, at_least=1)
+    embed_dim: Width = 128
     """Width of the network [128]."""
-    num_layers: int = number(3, at_least=1)
+    num_layers: NumLayers = 3
     """Transformer blocks [3]."""
-    num_heads: int = number(RECIPE_NETWORK["num_heads"], at_least=1)
-    """Attention heads [1]."""
-    encoder: str = "linear"
+    num_heads: Width = RECIPE_NETWORK["num_heads"]
+    """Attention heads, which share the width of the network evenly [1]."""
+    encoder: Encoder = "linear"
     """How observations become tokens [linear]."""
-    head: str | None = None
-    """Distribution of continuous actions: gaussian, mixture, binned or fixed_gaussian (default: that of
-    the preset, else gaussian) [fixed_gaussian in the authors' code]."""
+    head: Head | None = None
+    """Distribution of actions; continuous ones have all but categorical (default: that of the preset, else
+    the first that fits) [fixed_gaussian in the authors' code]."""
     standardize_obs: bool = False
     """Standardize observations by their mean and spread in the dataset [False]."""
-    holdout: int = number(200, at_least=1)
+    holdout: NumTrajectories = 200
     """Trajectories kept out of training for the validation loss."""
-    eval_tasks: int = number(64, at_least=1)
+    eval_tasks: NumTasks = 64
     """Tasks of the greedy evaluation on the way (no test tasks)."""
-    eval_every: int = number(1_000, at_least=1)
+    eval_every: Count = 1_000
     """Steps between evaluations."""
-    save_every: int = number(500, at_least=1)
+    save_every: Count = 500
     """Steps between checkpoints."""
     out: Path | None = None
     """Run folder (default: runs/pretrain/ENV/PRESET-seedSEED)."""
@@ -189,32 +209,99 @@ def pretrain_preset(env: str, preset: str) -> PretrainConfig:
     return config
 
 
-def pretrain_default(argv: Sequence[str]) -> PretrainConfig:
-    """The defaults that ``--env`` and ``--preset`` choose."""
-    return pretrain_preset(**early_values(argv, env=DEFAULT_WORLD, preset="fast"))
+def pretrain_default(config: PretrainConfig, flags: Iterable[str] = ()) -> PretrainConfig:
+    """The defaults that the world and the preset of a config choose, whatever else it says."""
+    return pretrain_preset(config.env, config.preset)
 
 
-def saved_pretraining(saved: Mapping[str, Any], where: Path) -> dict[str, Any]:
-    """The settings in the ``config.json`` of a run, also of one that was made with older names.
+def check_pretraining(config: PretrainConfig) -> None:
+    """Raise ``UsageError`` for settings of a training that are right by themselves, but not together."""
+    train, trajectories = config.train, config.data.trajectories
+    if train.batch_size % train.part_size:
+        raise UsageError(
+            f"--batch-size {train.batch_size} is not a multiple of --part-size {train.part_size}"
+        )
+    if config.embed_dim % config.num_heads:
+        raise UsageError(
+            f"--embed-dim {config.embed_dim} is not a multiple of --num-heads {config.num_heads}"
+        )
+    if config.holdout >= trajectories:
+        raise UsageError(
+            f"--holdout {config.holdout} leaves nothing of {trajectories} trajectories to train on; "
+            "lower it, or raise --trajectories"
+        )
+
+
+NO_SETTINGS = frozenset(
+    {"preset", "out", "resume", "debug", "tb", "wandb", "eval_every", "save_every"}
+)
+"""What a run may be resumed with changed: names, places, and how often and where to it reports."""
+
+
+def training_settings(config: PretrainConfig) -> dict[str, Any]:
+    """What decides about the result of a training, by the names of its flags, as JSON values."""
+    settings = dataclasses.asdict(config)
+    parts = {**settings, **settings["data"], **settings["train"]}
+    return {k: v for k, v in parts.items() if k not in NO_SETTINGS | {"data", "train"}}
+
+
+def saved_pretraining(path: Path) -> PretrainConfig:
+    """The settings in the ``config.json`` of a run.
 
     Raises:
-      UsageError: if they are no settings of a pre-training run.
+      DataError: if they are no settings of a pre-training run.
     """
-    if not isinstance(saved.get("data"), Mapping) or not isinstance(saved.get("train"), Mapping):
-        raise UsageError(f"{where} holds no settings of a pre-training run")
-    data = dict(saved["data"])
-    if "episodes" in data:
-        data["trajectories"] = data.pop("episodes")
-    return {**saved, "data": data}
+    return pretraining_from(read_document(path, dict[str, Json], MEND_RUN), path)
+
+
+MEND_RUN = "restore the file, or start a new run with --out"
+
+
+def pretraining_from(values: Mapping[str, Any], where: Path) -> PretrainConfig:
+    """The settings of a run from JSON values, also of one that was made with older names.
+
+    Args:
+      values: the values; what is missing has its default.
+      where: the file that they are from, for messages.
+
+    Raises:
+      DataError: if they are no settings of a pre-training run.
+    """
+    if "env" not in values:
+        raise DataError(f"{where} lacks env; {MEND_RUN}")
+    data = values.get("data")
+    if isinstance(data, Mapping) and "episodes" in data:
+        renamed = {{"episodes": "trajectories"}.get(k, k): v for k, v in data.items()}
+        values = {**values, "data": renamed}
+    return _from_json(PretrainConfig, values, where)
+
+
+def _from_json(settings_class: type, values: Any, where: Path) -> Any:
+    """A dataclass of settings from JSON values; ``DataError`` names the first that is wrong."""
+    if not isinstance(values, Mapping):
+        raise DataError(f"{where} holds no settings of a pre-training run; {MEND_RUN}")
+    types = types_of(settings_class)
+    found = {}
+    for name, value in values.items():
+        if name not in types:
+            raise DataError(f"{where} has the unknown setting {shown(name)}; {MEND_RUN}")
+        parts = list(get_parts(types[name]))
+        if group := [p for p in parts if isinstance(p, type) and dataclasses.is_dataclass(p)]:
+            found[name] = _from_json(group[0], value, where)
+            continue
+        found[name] = Path(value) if Path in parts and isinstance(value, str) else value
+        if said := setting_fault(types[name], found[name]):
+            raise DataError(f"{where}: {name} {said}; {MEND_RUN}")
+    return settings_class(**found)
 
 
 @dataclass(frozen=True)
 class AdaptConfig(Common):
     """Settings of ``experiments.adapt``; values in brackets are the paper's."""
 
-    env: str = DEFAULT_WORLD
+    env: Name = DEFAULT_WORLD
     """The world, by name or as module:attribute (``python -m experiments.list`` shows the names)."""
-    method: Annotated[str, tyro.conf.arg(aliases=("--bandit",))] = "ucb"
+    method: Annotated[Name, tyro.conf.arg(aliases=("--bandit",))] = "ucb"
     """Who adapts, by name or as module:attribute (``python -m experiments.list`` shows the names)."""
     policy: Path | None = None
     """Folder of a policy (default: the released one of the world)."""
@@ -223,15 +310,15 @@ class AdaptConfig(Common):
     tasks of the world)."""
     validation: bool = False
     """Adapt to as many tasks that are no test tasks, to choose a method's settings by."""
-    seeds: int = number(3, at_least=1)
+    seeds: NumSeeds = 3
     """Independent adaptations to each task [3]."""
-    episodes: int = number(100, at_least=1)
+    episodes: NumEpisodes = 100
     """Budget of episodes a task, the first evaluation of (g^M) included [100]."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the adaptations."""
-    eval_every: int = number(10, at_least=1)
+    eval_every: Count = 10
     """Episodes between evaluations of the best choice, which are outside of the budget."""
-    eval_episodes: int | None = number(None, at_least=1)
+    eval_episodes: NumEpisodes | None = None
     """Episodes that an evaluation averages (default: as the world's record says)."""
     keep_actions: bool = False
     """Also keep continuous actions in the results; discrete ones are always kept."""
@@ -239,7 +326,9 @@ class AdaptConfig(Common):
     """Result folder (default: runs/adapt/ENV/METHOD-seedSEED)."""
     figures: bool = True
     """Draw the figures."""
-    hyper: Annotated[Any, tyro.conf.arg(name="")] = None
+    resume: bool = False
+    """Go on with an adaptation that was stopped; the result is the same as without a stop."""
+    hyper: Annotated[Any, tyro.conf.arg(name="")] = field(default_factory=NoHyper)
     """Hyper-parameters of the method."""
 
     @property
@@ -252,20 +341,18 @@ class AdaptConfig(Common):
 class ReproduceConfig(Common):
     """Settings of ``experiments.reproduce``."""
 
-    what: tyro.conf.Positional[str]
+    what: tyro.conf.Positional[str] = ""
     """table4 (prompt length and c of UCB), table5 (datasets), figure8 (longer prompts) or heads
     (distributions of continuous actions)."""
-    env: str = DEFAULT_WORLD
+    env: Name = DEFAULT_WORLD
     """The world, by name or as module:attribute."""
-    only: tuple[str, ...] = ()
+    only: tuple[Name, ...] = ()
     """Names of the datasets (table5), prompt lengths (figure8) or heads to train (default: all)."""
-    steps: int | None = number(None, at_least=1)
+    steps: Count | None = None
     """Gradient steps of each training (default: those of the world's preset "ablation")."""
-    trajectories: Annotated[int | None, tyro.conf.arg(aliases=("--episodes",))] = number(
-        None, at_least=1
-    )
+    trajectories: Annotated[NumTrajectories | None, tyro.conf.arg(aliases=("--episodes",))] = None
     """Trajectories of each dataset (default: those of the world's preset "ablation")."""
-    seeds: int = number(3, at_least=1)
+    seeds: NumSeeds = 3
     """Independent adaptations to each test task [3]."""
     out: Path = RUNS / "reproduce"
     """Folder of all trainings and results; tables share what they have in common."""
@@ -285,3 +372,16 @@ class ReproduceConfig(Common):
 
     def _preset(self, name: str, default: int) -> int:
         return envs.find(self.env).presets.get("ablation", {}).get(name, default)
+
+
+def check_reproduction(config: ReproduceConfig) -> None:
+    """Raise ``UsageError`` for settings of ``experiments.reproduce`` that do not go together."""
+    if config.what == "table4":  # which trains nothing
+        for name in ("only", "steps", "trajectories"):
+            if getattr(config, name):
+                raise UsageError(f"table4 has no use for {flag(name)}; leave it out")
+    elif config.num_trajectories <= (kept := pretrain_preset(config.env, "fast").holdout):
+        raise UsageError(
+            f"--trajectories must be above {kept}, the trajectories kept out of training, found "
+            f"{config.num_trajectories}"
+        )

@@ -1,0 +1,268 @@
+"""Command lines as checked settings. tyro alone decides what the words mean.
+
+Defaults may depend on other flags, as those of ``pretrain`` do on ``--env``. So a command line is parsed
+twice by the same parser: once with the general defaults, from which the others are chosen, and once with
+those. No flag may be given twice, so both times have the same values.
+
+tyro takes numbers and choices as they were typed, and before it makes settings of them, the check that
+library calls go through as well says what is wrong with one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import difflib
+import io
+import itertools
+import math
+import re
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Annotated, Any, Literal, NoReturn, get_args
+
+import tyro
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+    StructConstructorSpec,
+    StructFieldSpec,
+    StructTypeInfo,
+)
+
+from envs.errors import UsageError, shown
+from mgpo_jax.settings import check_values, flag, is_settings, range_of, types_of
+
+Defaults = Callable[[Any, Sequence[str]], Any]
+"""``(config, flags) -> default config``: the defaults that a config chooses, which has the general ones
+where nothing was typed. ``flags`` are those on the command line that the config does not have."""
+
+
+def parse(
+    config_class: type,
+    argv: Sequence[str],
+    default: Defaults | None = None,
+    description: str = "",
+    prog: str = "",
+) -> Any:
+    """The checked settings of a command line.
+
+    Args:
+      config_class: a frozen dataclass of settings.
+      argv: the words of the command line.
+      default: what chooses the defaults, where they depend on other flags.
+      description: what the command does, for ``--help``.
+      prog: how the command is called, for messages.
+
+    Raises:
+      UsageError: for the first thing that is wrong.
+      SystemExit: after the help was printed.
+    """
+    words = list(argv)
+    if words and words[0].replace("_", "-").startswith("--tyro-"):  # tyro would write a file
+        _refuse_unknown(words, [], prog)
+    options: dict[str, Any] = {"description": description}
+    if default is not None:
+        first, unknown = _read(words, config_class, prog, add_help=False)
+        _check_flags(words, _flags(first))
+        chosen = default(first, [_flag_of(word) for word in unknown if word.startswith("--")])
+        _check_flags(words, _flags(chosen))
+        options["default"] = chosen
+    config, unknown = _read(words, config_class, prog, **options)
+    known = _flags(config)
+    _check_flags(words, known)
+    flags = itertools.takewhile(lambda word: word != "--", words)
+    # tyro takes a flag with odd characters for a word of its own
+    strange = [word for word in flags if word.startswith("--") and _flag_of(word) not in known]
+    if unknown or strange:
+        _refuse_unknown(unknown or strange, list(known), prog)
+    return config
+
+
+class _Refused(Exception):
+    """A value is refused. tyro has an answer of its own to a ValueError, such as UsageError is."""
+
+
+def _read(words: list[str], config_class: type, prog: str, **options: Any) -> tuple[Any, list[str]]:
+    """What tyro makes of a command line, and the words that it does not know."""
+    parsed: Any = tyro.conf.OmitArgPrefixes[config_class]
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(
+                parsed,
+                prog=prog or None,
+                args=words,
+                return_unknown_args=True,
+                registry=_registry(),
+                **options,
+            )
+    except _Refused as refused:
+        raise UsageError(str(refused)) from None
+    except SystemExit as stop:
+        if not stop.code:
+            raise  # the help was asked for
+        raise UsageError(_condensed(said.getvalue(), prog)) from None
+
+
+def _condensed(text: str, prog: str) -> str:
+    """A boxed message of tyro as one line, without its colors."""
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", text)
+    lines = [line.strip("│ ") for line in plain.splitlines() if line.startswith("│")]
+    body = [line for line in lines if not line.startswith("─")]
+    message = " ".join(body).split(". ")[0].rstrip(".")
+    if missing := re.match(r"Missing value for argument '([^']+)'", message):
+        message = f"{missing[1].split('/')[-1]} needs a value"  # aliases stand before it
+    return f"{message[:1].lower()}{message[1:]}; {_way_out(prog)}"
+
+
+def _way_out(prog: str) -> str:
+    return f"see {prog} --help".replace("  ", " ")
+
+
+def _flag_of(word: str) -> str:
+    """The flag that a word of a command line gives, in its usual spelling."""
+    return flag(word.partition("=")[0].removeprefix("--"))
+
+
+def _flags(config: Any) -> dict[str, str]:
+    """Every flag of a config, and the one that stands for it where a setting has several.
+
+    Raises:
+      UsageError: if two settings have the same flag, which a method of a user can cause.
+    """
+    found: dict[str, str] = {}
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if is_settings(value):
+            more = _flags(value)
+        else:
+            kind = types_of(config.__class__).get(field.name, field.type)
+            extras = get_args(kind)[1:]
+            if tyro.conf.Positional in extras:
+                continue
+            own = flag(field.name)
+            more = dict.fromkeys(
+                [
+                    own,
+                    *(alias for extra in extras for alias in getattr(extra, "aliases", None) or ()),
+                ],
+                own,
+            )
+            if isinstance(value, bool):
+                more[own.replace("--", "--no-", 1)] = own
+        if twice := found.keys() & more.keys():
+            raise UsageError(f"two settings have the flag {min(twice)}; rename one of them")
+        found |= more
+    return found
+
+
+def _check_flags(words: Sequence[str], known: dict[str, str]) -> None:
+    """Raise ``UsageError`` for a setting that is given twice, or a switch that is given a value.
+
+    As for tyro, a word that is a flag is never the value of the flag before it, and ``--`` ends the flags.
+    """
+    seen = set()
+    for word in itertools.takewhile(lambda word: word != "--", words):
+        own = known.get(_flag_of(word)) if word.startswith("--") else None
+        if own is None:
+            continue
+        if own in seen:
+            raise UsageError(f"{own} is given twice; leave one of them out")
+        if "=" in word and own.replace("--", "--no-", 1) in known:
+            raise UsageError(f"{own} takes no value, found {shown(word.partition('=')[2])}")
+        seen.add(own)
+
+
+def _refuse_unknown(unknown: Sequence[str], known: Sequence[str], prog: str) -> NoReturn:
+    """Raise ``UsageError`` for words that nothing on the command line takes."""
+    for word in unknown:
+        if word.startswith("--"):
+            name = word.partition("=")[0]
+            near = difflib.get_close_matches(_flag_of(word), known, n=1)
+            hint = f"; did you mean {near[0]}?" if near else ""
+            raise UsageError(f"unknown flag {shown(name)}{hint}; {_way_out(prog)}")
+    raise UsageError(f"no flag takes the word {shown(unknown[0])}; {_way_out(prog)}")
+
+
+def _registry() -> ConstructorRegistry:
+    """How tyro reads and checks the values of settings, and what its help says of their ranges."""
+    registry = ConstructorRegistry()
+    registry.primitive_rule(_number)
+    registry.primitive_rule(_choice)
+    under_way: set[type] = set()
+
+    @registry.struct_rule
+    def settings(info: StructTypeInfo) -> StructConstructorSpec | None:
+        if info.type in under_way or not dataclasses.is_dataclass(info.type):
+            return None
+        under_way.add(info.type)
+        try:
+            spec = ConstructorRegistry.get_struct_spec(info)  # tyro's own rule for dataclasses
+        finally:
+            under_way.discard(info.type)
+        if not isinstance(spec, StructConstructorSpec):
+            return None
+        return StructConstructorSpec(
+            instantiate=partial(_checked, info.type, spec.instantiate),
+            fields=tuple(map(_with_range, spec.fields)),
+        )
+
+    return registry
+
+
+def _checked(settings_class: type, make: Callable[..., Any], **values: Any) -> Any:
+    """What ``make`` makes of values that are right."""
+    try:
+        check_values(settings_class, values)
+    except UsageError as error:
+        raise _Refused(str(error)) from None
+    return make(**values)
+
+
+def _with_range(field: StructFieldSpec) -> StructFieldSpec:
+    """The field, whose help names its range beside its default."""
+    text = range_of(field.type)
+    if not text:
+        return field
+    hint = tyro.conf.arg(help_behavior_hint=lambda default: f"({text}; default: {default})")
+    with_hint: Any = Annotated[field.type, hint]
+    return dataclasses.replace(field, type=with_hint)
+
+
+def _number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    """A number, or the text that was typed where it is none."""
+    if info.type not in (int, float):
+        return None
+    kind = info.type
+
+    def read(words: list[str]) -> Any:
+        try:
+            value = kind(words[0])
+        except ValueError:
+            return words[0]
+        too_large = value in (math.inf, -math.inf) and "inf" not in words[0].lower()
+        return words[0] if too_large else value
+
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=kind.__name__.upper(),
+        instance_from_str=read,
+        is_instance=lambda value: isinstance(value, kind),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+def _choice(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    """One of several words, or another one that was typed."""
+    if info.type_origin is not Literal:
+        return None
+    choices = get_args(info.type)
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="{" + ",".join(map(str, choices)) + "}",
+        instance_from_str=lambda words: words[0],
+        is_instance=lambda value: value in choices,
+        str_from_instance=lambda value: [str(value)],
+    )
