@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
 from pathlib import Path
 
 
@@ -19,4 +21,19 @@ def _prefer_this_project() -> None:
         sys.path.append(here)
 
 
+def _leave_quietly() -> None:
+    """Let Ctrl-C end a command while its modules are imported: at once and without a traceback.
+
+    A KeyboardInterrupt in the middle of an import can be swallowed, or leave the interpreter crashing.
+    """
+    started = Path(sys.argv[0]).name if sys.argv else ""
+    as_command = started in (
+        "-m",
+        "mgpo",
+    )  # ``python -m`` calls itself so until the module is found
+    if as_command and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, lambda number, frame: os._exit(128 + number))
+
+
 _prefer_this_project()
+_leave_quietly()

@@ -13,23 +13,25 @@ the process that matter on a CPU, all in one place:
 
 from __future__ import annotations
 
-import argparse
 import ctypes
+import errno
 import os
 import platform
 import sys
+import tempfile
+import threading
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
-import tyro
-
-from envs.errors import DataError, UsageError
-from mgpo_jax.settings import check_settings
+from envs.errors import DataError, UsageError, printable, shown
+from experiments import signals
+from mgpo_jax.claims import check_place
 
 EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
 # mallopt parameters of the GNU C library
 M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -2, -3, -8
@@ -56,52 +58,126 @@ def configure() -> None:
         libc.mallopt(M_TRIM_THRESHOLD, (1 << 31) - 1)
         libc.mallopt(M_TOP_PAD, 1 << 28)
 
-    cache = os.environ.get("MGPO_CACHE", str(Path.home() / ".cache" / "mgpo_jax"))
+    os.environ["JAX_ENABLE_X64"] = "0"  # everything here is float32
     # jax reads these when it is imported, which is after a command has found nothing wrong.
+    cache = cache_folder()
     os.environ["JAX_COMPILATION_CACHE_DIR"] = cache
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.5"
     if "jax" in sys.modules:  # a world or method of a user was imported with it
         import jax
 
+        jax.config.update("jax_enable_x64", False)
         jax.config.update("jax_compilation_cache_dir", cache)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def cache_folder() -> str:
+    """Where compiled programs are kept: ``$MGPO_CACHE``, or ``~/.cache/mgpo_jax``."""
+    if "MGPO_CACHE" in os.environ:
+        return os.environ["MGPO_CACHE"]
+    try:
+        home = Path.home()
+    except RuntimeError:  # a user without a home, as in some containers
+        home = Path(tempfile.gettempdir())
+    return str(home / ".cache" / "mgpo_jax")
 
 
 def run(
     config_class: type,
     main: Callable[[Any], None],
-    default: Callable[[Sequence[str]], Any] | None = None,
+    default: Callable[[Any, Sequence[str]], Any] | None = None,
     argv: Sequence[str] | None = None,
 ) -> NoReturn:
     """Parse a command line into ``config_class`` and run ``main`` on it; exits.
 
-    Exit codes: 0 done, 1 failed, 2 usage, 130 interrupted.
+    Exit codes: 0 done, 1 failed, 2 usage, 128 plus the number of a signal that ended it (130: Ctrl-C).
 
     Args:
       config_class: a frozen dataclass derived from ``Common``.
       main: the command; it imports what needs jax by itself.
-      default: ``argv -> default config``, where defaults depend on other flags.
+      default: what chooses the defaults, where they depend on other flags; see ``parsing.parse``.
       argv: the words of the command line (default: those of the process).
     """
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words
+    _make_sturdy()
+    config = None
     try:
-        values = {} if default is None else {"default": default(words)}
-        parsed: Any = tyro.conf.OmitArgPrefixes[config_class]
-        config = tyro.cli(
-            parsed, prog=program_name(), args=words, description=main.__doc__, **values
-        )
-        check_settings(config)
-        configure()
-        main(config)
+        with signals.watched():
+            from experiments.parsing import parse
+
+            text = main.__doc__ or ""
+            config = parse(config_class, words, default, description=text, prog=program_name())
+            configure()
+            main(config)
+    except signals.Stopped as stop:
+        _fail(str(stop), 128 + stop.number, debug, "")
     except KeyboardInterrupt:
         sys.exit(EXIT_INTERRUPTED)
     except (UsageError, DataError) as error:
         _fail(str(error), EXIT_USAGE if isinstance(error, UsageError) else EXIT_FAILED, debug)
     except Exception as error:
-        text = f"{type(error).__name__}: {error}".splitlines()[0]
-        _fail(f"{text} (run with --debug for the traceback)", EXIT_FAILED, debug)
+        too_long = isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG
+        _fail(explained(error, config), EXIT_USAGE if too_long else EXIT_FAILED, debug)
     sys.exit(0)
+
+
+def _make_sturdy() -> None:
+    """Let no output and no other thread spoil a command: what cannot be printed is escaped, and an error
+    in a thread is reported by the main thread alone, which meets it as well."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
+    if "--debug" not in sys.argv:
+        threading.excepthook = lambda args: None
+
+
+def say(text: str) -> None:
+    """Print a result. Where stdout is closed or full, the command goes on without it."""
+    if sys.stdout is None:
+        return
+    try:
+        "±".encode(sys.stdout.encoding or "utf-8")
+    except UnicodeEncodeError:
+        text = text.replace("±", "+-")
+    try:
+        print(text, flush=True)
+    except OSError as error:
+        # Whatever is left in the stream's buffer must not fail again when the interpreter ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):
+            print(f"stdout cannot be written ({error.strerror})", file=sys.stderr)
+
+
+def explained(error: BaseException, config: Any = None) -> str:
+    """An error that was not foreseen, as one line that says what to do where that is known."""
+    for cause in _causes(error):
+        if isinstance(cause, OSError) and cause.errno in NO_ROOM:
+            folder = (
+                cause.filename or getattr(config, "out", None) or getattr(config, "folder", None)
+            )
+            where = f" for {folder}" if folder else ""
+            again = "--resume" if hasattr(config, "resume") else "the same command"
+            return f"there is no room left on the disk{where}; make room and go on with {again}"
+        if isinstance(cause, OSError) and cause.errno in (errno.EACCES, errno.EROFS, errno.EPERM):
+            return f"{cause.filename} cannot be written or read ({cause.strerror})"
+        if isinstance(cause, OSError) and cause.errno == errno.ENAMETOOLONG:
+            return f"the name {shown(cause.filename)} is too long; choose a shorter one"
+        if isinstance(cause, MemoryError):
+            return "there is not enough memory; ask for less at once, such as fewer --seeds"
+    text = str(error).splitlines()[0] if str(error) else type(error).__name__
+    if "backend" in text and (platforms := os.environ.get("JAX_PLATFORMS")):
+        return f"JAX_PLATFORMS={platforms} names no device of this machine; unset it, or use cpu"
+    return f"{type(error).__name__}: {text} (run with --debug for the traceback)"
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    """An error, and those that it was raised from or beside."""
+    seen: set[int] = set()
+    while error is not None and id(error) not in seen:
+        seen.add(id(error))
+        yield error
+        error = error.__cause__ or error.__context__
 
 
 def program_name() -> str:
@@ -112,29 +188,25 @@ def program_name() -> str:
     return f"python -m experiments.{stem}"
 
 
-def _fail(message: str, code: int, debug: bool) -> NoReturn:
+def _fail(message: str, code: int, debug: bool, prefix: str = "error: ") -> NoReturn:
     if debug:
         traceback.print_exc()
-    print(f"error: {message}", file=sys.stderr)
+    if sys.stderr is not None:
+        print(f"{prefix}{printable(message)}", file=sys.stderr)
     sys.exit(code)
 
 
-def early_values(argv: Sequence[str], **flags: str) -> dict[str, str]:
-    """The values of flags that decide which other flags there are.
-
-    Args:
-      argv: the words of the command line.
-      **flags: defaults by name; a name like ``method__bandit`` stands for ``--method`` and ``--bandit``.
-    """
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    for names, default in flags.items():
-        options = ["--" + name.replace("_", "-") for name in names.split("__")]
-        parser.add_argument(*options, dest=names.split("__")[0], default=default, nargs="?")
-    found, _ = parser.parse_known_args([word for word in argv if word != "--"])
-    return {name: value or flags.get(name, "") for name, value in vars(found).items()}
-
-
 def refuse_existing(folder: Path, *ways_out: str) -> None:
-    """Raise ``UsageError`` with the ways out if an output folder exists."""
-    if folder.exists():
+    """Raise ``UsageError`` with the ways out if an output exists, or if it could not be made."""
+    if os.path.lexists(folder):
         raise UsageError(f"{folder} exists already; {', or '.join(ways_out)}")
+    check_place(folder)
+
+
+def refuse_existing_file(path: Path, flag: str) -> None:
+    """Raise ``UsageError`` if a file to be written exists, or if it could not be made."""
+    if os.path.lexists(path):
+        raise UsageError(f"{flag} {path} exists already; remove it or choose another file")
+    if not path.name or not path.absolute().parent.is_dir():
+        raise UsageError(f"{flag} {path}: there is no folder {path.parent}; make it first")
+    check_place(path, flag)

@@ -1,15 +1,20 @@
-"""Files that are never seen half written, and reading them with errors that say what is wrong."""
+"""Files and folders that are never seen half written.
+
+A file is written beside its place, flushed to disk and renamed; a folder is filled under the name
+``NAME.partial`` and renamed. A process that is killed at any moment leaves either the old or the new, and
+what it was writing is removed by the next one that works there.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import os
+import secrets
 import shutil
-import zipfile
-import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,44 +22,15 @@ from typing import Any
 import numpy as np
 
 from envs.errors import DataError
+from mgpo_jax.claims import LOCK, claimed, cleaned_on_exit
+
+TEMPORARY = ".writing-"  # how the names of files begin that are being written
 
 
 def hash_file(path: Path) -> str:
     """SHA-256 of a file."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def load_arrays(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an npz file.
-
-    Raises:
-      DataError: if it is missing or damaged, or is something else.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return dict(file)
-    # TypeError: a lone array, whatever the name of its file says
-    except (OSError, EOFError, TypeError, ValueError, zipfile.BadZipFile, zlib.error):
-        raise DataError(f"{path} is not a readable npz file") from None
-
-
-def read_object(path: Path, mend: str = "") -> dict[str, Any]:
-    """The JSON object in a file.
-
-    Raises:
-      DataError: if it is missing, is not JSON or is something else; the message ends in ``mend``.
-    """
-    tail = f"; {mend}" if mend else ""
-    try:
-        value = json.loads(path.read_text())
-    except OSError:
-        raise DataError(f"{path} is missing{tail}") from None
-    except ValueError:
-        raise DataError(f"{path} is not readable JSON{tail}") from None
-    if not isinstance(value, dict):
-        raise DataError(f"{path} does not hold a JSON object{tail}")
-    return value
 
 
 def to_json(value: Any) -> Any:
@@ -70,29 +46,135 @@ def to_json(value: Any) -> Any:
     return value.item() if hasattr(value, "item") else value
 
 
+@contextmanager
+def written(path: Path) -> Iterator[Path]:
+    """A place beside ``path`` to write a file to, which takes its name when all of it is on disk.
+
+    It has the same suffix. If writing fails, ``path`` stays as it was.
+    """
+    partial = path.with_name(f"{TEMPORARY}{secrets.token_hex(4)}{path.suffix}")
+    with cleaned_on_exit(partial.unlink):
+        try:
+            yield partial
+            with open(partial, "rb") as file:
+                os.fsync(file.fileno())
+            os.replace(partial, path)
+            flush_folder(path.parent)
+        finally:
+            partial.unlink(missing_ok=True)
+
+
+def flush_folder(folder: Path) -> None:
+    """Bring the names in a folder to disk, so that a renamed file survives a power cut."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError:  # some network file systems cannot; the data itself is on disk
+        pass
+    finally:
+        os.close(descriptor)
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Remove the files that a killed process was writing in a folder; only its owner may do so."""
+    for path in folder.glob(f"{TEMPORARY}*"):
+        path.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, whole or not at all."""
+    with written(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
 def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file that is never seen half written."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(json.dumps(to_json(value), indent=2) + "\n")
-    partial.rename(path)
+    """Write a JSON file, whole or not at all.
+
+    Raises:
+      ValueError: for NaN or infinity, which JSON does not have.
+    """
+    write_text(path, json.dumps(to_json(value), indent=2, allow_nan=False) + "\n")
+
+
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], compressed: bool = True) -> None:
+    """Write an npz file, whole or not at all."""
+    save: Any = np.savez_compressed if compressed else np.savez
+    with written(path) as partial:
+        save(partial, allow_pickle=False, **arrays)
 
 
 @contextmanager
-def new_folder(folder: Path) -> Iterator[Path]:
-    """A place to write to, which becomes ``folder`` when all is written.
+def new_folder(folder: Path, keep: str = "", wait: bool = False) -> Iterator[Path]:
+    """A place to write to, in ``NAME.partial``, which becomes ``folder`` when all is written.
 
-    If writing fails, what was written so far is removed.
+    ``NAME.partial`` is claimed, so that no other process writes there, and removed afterwards. What a
+    killed process left in it is removed as well, except for a folder ``keep`` in it with finished pieces of
+    work (npz files) to go on from, which stays until ``folder`` is there.
+
+    With ``wait``, another process that writes there is waited for.
 
     Raises:
-      DataError: if ``folder`` exists.
+      ExistsError: if ``folder`` exists.
+      DataError: if another process writes there.
+      UsageError: if nothing can be written there.
     """
-    if folder.exists():
-        raise DataError(f"{folder} exists already; remove it or choose another place with --out")
-    partial = folder.with_name(f"{folder.name}.partial-{os.getpid()}")
-    partial.mkdir(parents=True)
-    try:
-        yield partial
-        partial.rename(folder)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
+    folder = Path(folder)
+    partial = partial_name(folder)
+    if os.path.lexists(folder):
+        raise exists_already(folder)
+    with claimed(partial, wait=wait):
+        if os.path.lexists(folder):  # another process has finished it meanwhile
+            raise exists_already(folder)
+        clear = functools.partial(_clear, partial, keep)
+        clear()
+        place = partial / "result"
+        place.mkdir()
+        try:
+            with cleaned_on_exit(clear):
+                yield place
+            os.rename(place, folder)
+        except BaseException:
+            clear()
+            raise
+        flush_folder(folder.parent)
+        _clear(partial)
+
+
+class ExistsError(DataError):
+    """A folder that was to be made exists."""
+
+
+def exists_already(folder: Path) -> ExistsError:
+    return ExistsError(f"{folder} exists already; remove it or choose another place with --out")
+
+
+def partial_name(folder: Path) -> Path:
+    """Where a new folder is written."""
+    return folder.with_name(f"{folder.name}.partial")
+
+
+def _clear(partial: Path, keep: str = "") -> None:
+    """Remove what is in an unfinished folder, but for the claim on it and finished work in ``keep``."""
+    kept = {LOCK, keep if keep and has_work(partial / keep) else LOCK}
+    for path in partial.iterdir() if partial.is_dir() else ():
+        if path.name in kept:
+            continue
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def has_work(folder: Path) -> bool:
+    """Whether a folder holds finished pieces of work."""
+    return any(not path.name.startswith(TEMPORARY) for path in folder.glob("*.npz"))
+
+
+def hash_arrays(arrays: Mapping[str, np.ndarray]) -> str:
+    """SHA-256 of names, dtypes, shapes and contents of arrays."""
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        array = np.asarray(arrays[name])
+        digest.update(f"{name} {array.dtype} {array.shape} ".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()

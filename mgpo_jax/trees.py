@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Int
 
 
@@ -30,3 +32,17 @@ def named_leaves(tree: Any, lone: str) -> dict[str, Any]:
     return {
         jax.tree_util.keystr(path, simple=True, separator=".") or lone: leaf for path, leaf in paths
     }
+
+
+def numbered_leaves(tree: Any) -> dict[str, np.ndarray]:
+    """The leaves of a pytree by their place in it, to be written to a file."""
+    return {f"leaf{i:03}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(tree))}
+
+
+def with_leaves(like: Any, leaves: Mapping[str, np.ndarray]) -> Any:
+    """A pytree of the structure of ``like`` from its ``numbered_leaves``.
+
+    Raises:
+      ValueError: if there are more or fewer of them.
+    """
+    return jax.tree.unflatten(jax.tree.structure(like), [leaves[name] for name in sorted(leaves)])

@@ -1,0 +1,124 @@
+"""Requests to stop: Ctrl-C (SIGINT), SIGTERM, and SIGUSR1, which schedulers send before they kill.
+
+The operating system tells a thread of its own about a signal, at once even while the main thread is deep
+inside a compiled program. What happens then depends on what the command is doing: it is left at once, after
+cleaning up, or (``asked_to_stop``) it is asked to stop at its next chance. The second request always ends
+it at once. All exit with 128 plus the signal's number.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+SIGNALS = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGUSR1") if hasattr(signal, name)
+)
+
+
+class Stopped(KeyboardInterrupt):
+    """A command stopped because it was asked to; ``number`` is that of the signal."""
+
+    def __init__(self, message: str, number: int) -> None:
+        super().__init__(message)
+        self.number = number
+
+
+class _Watch:
+    """What signals do at present."""
+
+    def __init__(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        """Be as if no signal had come and no command were running."""
+        self.asked: list[int] = []
+        self.farewell: Callable[[], str] = lambda: ""
+        self.patient = False
+
+    def receive(self, number: int) -> None:
+        self.asked.append(number)
+        if len(self.asked) == 1 and self.patient:
+            _say("stopping soon; a second request ends it at once")
+            return
+        if len(self.asked) == 1 and (text := self.farewell()):
+            _say(text)
+        leave(number)
+
+
+_watch = _Watch()
+
+
+def _say(text: str) -> None:
+    if sys.stderr is not None:
+        print(f"\n{text}" if sys.stderr.isatty() else text, file=sys.stderr, flush=True)
+
+
+def leave(number: int) -> None:
+    """Clean up and end the process, whatever it is doing."""
+    from mgpo_jax.claims import clean_up
+
+    clean_up()
+    os._exit(128 + number)
+
+
+@contextmanager
+def watched() -> Iterator[None]:
+    """Receive signals in the block. In a thread, where signals cannot be received, nothing changes."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    _watch.forget()
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    before = {number: signal.signal(number, _nothing) for number in SIGNALS}
+    pipe_before = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
+    listener = threading.Thread(target=_listen, args=(reading,), daemon=True)
+    listener.start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(pipe_before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        os.write(writing, b"\0")  # ends the listener
+        listener.join()
+        os.close(writing)
+        os.close(reading)
+        _watch.forget()
+
+
+def _nothing(number: int, frame: FrameType | None) -> None:
+    """The listener does what has to be done."""
+
+
+def _listen(reading: int) -> None:
+    while number := os.read(reading, 1)[0]:
+        if number in SIGNALS:
+            _watch.receive(number)
+
+
+@contextmanager
+def asked_to_stop() -> Iterator[Callable[[], int]]:
+    """Lets the block stop at a time of its choice: gives a function that tells the number of the signal
+    that asks for it, or 0."""
+    _watch.patient = True
+    try:
+        yield lambda: _watch.asked[0] if _watch.asked else 0
+    finally:
+        _watch.patient = False
+
+
+@contextmanager
+def farewell(text: Callable[[], str]) -> Iterator[None]:
+    """What is said when the block is left at once."""
+    before, _watch.farewell = _watch.farewell, text
+    try:
+        yield
+    finally:
+        _watch.farewell = before

@@ -1,0 +1,182 @@
+"""Claims on folders: a folder has one process that works in it, and any other is told who that is.
+
+A claim is a lock of the operating system on a file in the folder. It ends with the process, however the
+process ends, so that nothing has to be cleaned up by hand.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import socket
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from envs.errors import DataError, UsageError, printable
+
+try:
+    import fcntl
+except ImportError:  # Windows, where folders are not claimed
+    fcntl = None  # type: ignore[assignment]
+
+LOCK = ".lock"
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # of some network file systems
+_ON_EXIT: list[Callable[[], None]] = []
+
+
+class InUseError(DataError):
+    """Another process works in a folder."""
+
+
+class Claim:
+    """A folder that this process holds."""
+
+    def __init__(self, folder: Path, descriptor: int, made: Sequence[Path]) -> None:
+        self.folder = folder
+        self._descriptor = descriptor
+        self._made = made  # folders that did not exist before, the innermost first
+
+    def leave(self) -> None:
+        """Remove the traces of the claim: the lock, and the folders that are empty then."""
+        if _is_at(self.folder / LOCK, self._descriptor):
+            (self.folder / LOCK).unlink(missing_ok=True)
+            with suppress(OSError):
+                for folder in (self.folder, *self._made):
+                    folder.rmdir()  # only an empty folder can be removed
+
+    def close(self) -> None:
+        self.leave()
+        os.close(self._descriptor)
+
+
+@contextmanager
+def claimed(folder: Path, wait: bool = False) -> Iterator[None]:
+    """Hold a folder, which is made if it is missing and removed afterwards if it is empty then.
+
+    So are folders above it that had to be made.
+
+    Args:
+      folder: the folder.
+      wait: wait for another process that holds it, after a line on stderr that says so.
+
+    Raises:
+      InUseError: if another process holds it.
+      UsageError: if nothing can be written there.
+    """
+    if not os.path.exists(folder):
+        check_place(folder)
+    made = [above for above in folder.absolute().parents if not above.exists()]
+    descriptor = None
+    while descriptor is None:
+        descriptor = _try_to_hold(folder, wait)
+    claim = Claim(folder, descriptor, made)
+    try:
+        with cleaned_on_exit(claim.leave):
+            yield
+    finally:
+        claim.close()
+
+
+def _try_to_hold(folder: Path, wait: bool) -> int | None:
+    """The descriptor of a lock that is held; None if the folder vanished meanwhile."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except FileNotFoundError:
+        if folder.parent.is_dir() and not os.path.lexists(folder):
+            return None  # removed between the two calls by the process that held it
+        raise cannot_write(folder, "no such place") from None
+    except OSError as error:
+        raise cannot_write(folder, error.strerror) from None
+    try:
+        _lock(descriptor, folder, wait)
+        if _is_at(folder / LOCK, descriptor):
+            os.ftruncate(descriptor, 0)
+            os.write(descriptor, f"{os.getpid()} on {socket.gethostname()}\n".encode())
+            return descriptor
+    except BaseException:
+        os.close(descriptor)
+        raise
+    os.close(descriptor)
+    return None
+
+
+def _lock(descriptor: int, folder: Path, wait: bool) -> None:
+    if fcntl is None:
+        return
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        holder = printable(os.pread(descriptor, 200, 0).decode(errors="replace").strip())
+        who = f"process {holder}" if holder else "another process"
+        if not wait:
+            raise InUseError(
+                f"{folder} is in use by {who}; wait for its end or choose another place with --out"
+            ) from None
+        print(f"waiting for {who}, which works in {folder}", file=sys.stderr)
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
+            raise
+
+
+def _is_at(path: Path, descriptor: int) -> bool:
+    """Whether an open file is still the one at a path."""
+    try:
+        return os.path.samestat(os.stat(path), os.fstat(descriptor))
+    except OSError:
+        return False
+
+
+def cannot_write(folder: Path, reason: str | None) -> UsageError:
+    return UsageError(f"cannot write to {folder} ({reason}); choose another place with --out")
+
+
+def check_place(path: Path, flag: str = "--out", num_bytes: int = 1 << 20) -> None:
+    """Raise ``UsageError`` if nothing can be written at a path that does not exist yet.
+
+    Args:
+      path: a file or folder to be made.
+      flag: which flag names it, for the message.
+      num_bytes: room that must be free there.
+    """
+    place = path.absolute()
+    try:
+        longest = max(len(os.fsencode(part)) for part in place.parts)
+        while not os.path.exists(place):
+            place = place.parent
+        too_long = longest + len(".partial") > os.pathconf(place, "PC_NAME_MAX")
+        free = shutil.disk_usage(place).free
+    except OSError as error:
+        raise UsageError(f"{flag} {printable(str(path))}: {error.strerror}") from None
+    fault = None
+    if too_long:
+        fault = "its name is too long"
+    elif not os.path.isdir(place):
+        fault = f"{place} is no folder"
+    elif not os.access(place, os.W_OK | os.X_OK):
+        fault = f"{place} is not writable"
+    elif free < num_bytes:
+        fault = f"{place} has {free / 1e6:.1f} MB free, {num_bytes / 1e6:.0f} MB are needed"
+    if fault:
+        raise UsageError(f"{flag} {printable(str(path))}: {fault}; choose another place")
+
+
+@contextmanager
+def cleaned_on_exit(clean: Callable[[], None]) -> Iterator[None]:
+    """Note what cleans up behind the block if the process is asked to leave at once."""
+    _ON_EXIT.append(clean)
+    try:
+        yield
+    finally:
+        _ON_EXIT.remove(clean)
+
+
+def clean_up() -> None:
+    """Clean up behind everything that is under way, the last begun first."""
+    for clean in reversed(_ON_EXIT):
+        with suppress(OSError):
+            clean()

@@ -1,0 +1,48 @@
+"""Finished pieces of a long work on disk, so that a process that was killed can go on where it was."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from mgpo_jax.files import hash_arrays, remove_unfinished, write_arrays
+
+_HASH = "sha256"
+
+
+class Journal:
+    """Records of arrays by name; each is on disk when ``write`` returns, whole or not at all.
+
+    Args:
+      folder: where the records are; None keeps nothing.
+    """
+
+    def __init__(self, folder: Path | None = None) -> None:
+        self.folder = folder
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            remove_unfinished(folder)
+
+    def read(self, name: str) -> dict[str, np.ndarray] | None:
+        """The record of that name, or None if there is none that is sound."""
+        path = None if self.folder is None else self.folder / f"{name}.npz"
+        if path is None or not path.is_file():
+            return None
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                arrays = dict(file)
+            if str(arrays.pop(_HASH)) != hash_arrays(arrays):
+                raise ValueError("hash")
+        except Exception:  # numpy and zipfile raise many kinds for a damaged file
+            print(f"{path} is damaged; that piece of the work is done again", file=sys.stderr)
+            return None
+        return arrays
+
+    def write(self, name: str, arrays: Mapping[str, np.ndarray]) -> None:
+        """Keep a record."""
+        if self.folder is not None:
+            sealed = {**arrays, _HASH: np.array(hash_arrays(arrays))}
+            write_arrays(self.folder / f"{name}.npz", sealed, compressed=False)

@@ -1,0 +1,74 @@
+"""Progress of long work on stderr: a bar on a terminal, elsewhere a line every half minute."""
+
+from __future__ import annotations
+
+import sys
+import time
+from types import TracebackType
+from typing import Any
+
+from tqdm import tqdm
+
+EVERY = 30.0  # seconds between two lines where stderr is no terminal
+
+
+class Progress:
+    """Counts ``unit``s up to ``total``, and shows figures beside the count.
+
+    Args:
+      total: how many there are.
+      unit: what is counted, such as ``step``.
+      initial: how many were done before.
+    """
+
+    def __init__(self, total: int, unit: str, initial: int = 0) -> None:
+        self._bar = tqdm(total=total, initial=initial, unit=unit, disable=None)
+        self._total, self._unit, self._initial = total, unit, initial
+        self._done, self._figures = initial, ""
+        self._start = self._last = time.monotonic()
+
+    def update(self, num: int = 1) -> None:
+        """Count ``num`` more."""
+        self._bar.update(num)
+        self._done += num
+        now = time.monotonic()
+        if self._bar.disable and now - self._last >= EVERY:
+            self._last = now
+            print(self._line(now), file=sys.stderr, flush=True)
+
+    def show(self, figures: dict[str, str]) -> None:
+        """Figures to stand beside the count from now on."""
+        self._bar.set_postfix(figures)
+        self._figures = "".join(f", {name} {value}" for name, value in figures.items())
+
+    def _line(self, now: float) -> str:
+        per_unit = (now - self._start) / max(self._done - self._initial, 1)
+        left = per_unit * (self._total - self._done)
+        share = 100 * self._done / max(self._total, 1)
+        return (
+            f"{self._unit} {self._done:,} of {self._total:,} ({share:.0f} %){self._figures}, "
+            f"{_duration(left)} left"
+        )
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        del kind, error, trace
+        self.close()
+
+    def close(self) -> None:
+        self._bar.close()
+
+
+def _duration(seconds: float) -> str:
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    parts: list[tuple[Any, str]] = [(hours, "h"), (minutes, "min"), (seconds, "s")]
+    shown = [f"{number} {unit}" for number, unit in parts if number]
+    return " ".join(shown[:2]) or "0 s"
