@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
-from envs.errors import UsageError, nearest
+from envs.errors import DataError, UsageError, nearest, printable, shown
 
 if TYPE_CHECKING:
     from envs.base import Demonstrator, Environment
@@ -144,6 +144,33 @@ class Registry(Generic[Record]):
             self._loaded[place] = self._load(place)
         return self._loaded[place]
 
+    def known(self, name: str, where: object, flag: str = "") -> Record:
+        """The record of a name that was read from a file, which is data: no module is imported for it.
+
+        Args:
+          name: a registered name, that of an entry point, or that or the place of a record in use already.
+          where: the file, for messages.
+          flag: the flag with which a user can name the record, for messages (default: there is none).
+
+        Raises:
+          DataError: if no such record is known.
+        """
+        if name in self._loaded:
+            return self._loaded[name]
+        for record in self._loaded.values():
+            if record.name == name:  # type: ignore[attr-defined]
+                return record
+        if ":" in name:
+            advice = f"; give it with {flag} {printable(name)}" if flag else ""
+            raise DataError(
+                f"{where} names the {self.kind} {shown(name)}, which is not loaded{advice}"
+            )
+        try:
+            return self.find(name)
+        except UsageError as error:
+            advice = f"; give its place with {flag} module:attribute" if flag else ""
+            raise DataError(f"{where}: {error}{advice}") from None
+
     def _load(self, place: str) -> Record:
         module, _, attribute = place.partition(":")
         here = os.getcwd()
@@ -151,11 +178,15 @@ class Registry(Generic[Record]):
             sys.path.append(here)  # last, so that the current folder never shadows a package
         try:
             record = getattr(importlib.import_module(module), attribute)
-        except (ImportError, AttributeError) as error:
-            raise UsageError(f"cannot load the {self.kind} {place!r}: {error}") from None
+        except (ImportError, AttributeError, ValueError) as error:
+            raise UsageError(
+                f"cannot load the {self.kind} {shown(place)}: {printable(str(error))}; give it as "
+                "module:attribute of a module that can be imported"
+            ) from None
         if not isinstance(record, self.type):
             raise UsageError(
-                f"{place} is a {type(record).__name__}, not a {self.type.__name__} record"
+                f"{place} is a {type(record).__name__}; the place of a {self.kind} must be that of a "
+                f"{self.type.__name__} record"
             )
         name: str = record.name  # type: ignore[attr-defined]
         taken = self._registered.get(name)

@@ -16,28 +16,33 @@ import tyro
 
 from envs.errors import UsageError
 from experiments.runtime import Common, refuse_existing, run
+from experiments.store.runs import is_finished
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReleaseConfig(Common):
     """Settings of ``experiments.release``."""
 
-    source: tyro.conf.Positional[Path]
+    source: tyro.conf.Positional[Path | None] = None
     """Folder of a finished pre-training run."""
     out: Path | None = None
     """Folder to write (default: mgpo_jax/pretrained/ENV)."""
+    env: str | None = None
+    """The world of the run, as module:attribute where it has no registered name."""
 
 
 def main(config: ReleaseConfig) -> None:
     """Package a finished pre-training run as a released policy."""
-    policy = config.source / "policy"
-    if not policy.is_dir():
+    if config.source is None:
+        raise UsageError("no run folder given; usage: python -m experiments.release RUN_DIR")
+    if not is_finished(config.source):
         raise UsageError(f"{config.source} has no finished policy; let its training end first")
-    from experiments.store.cards import release, world_of
+    from experiments.store.cards import read_run, release
 
-    folder = config.out or world_of(policy)
+    finished = read_run(config.source, config.env)
+    folder = config.out or finished.released
     refuse_existing(folder, "remove it", "choose another with --out")
-    release(config.source, folder)
+    release(finished, folder)
     print(f"released in {folder}", file=sys.stderr)
 
 

@@ -7,21 +7,37 @@ length of each trajectory) and ``manifest.json`` (what it is, how it was made, i
 from __future__ import annotations
 
 import hashlib
-import json
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+from annotated_types import Ge, Le
+from pydantic import BaseModel
 
 from envs.base import EnvSpec, Trajectory
-from envs.errors import DataError
-from mgpo_jax.files import hash_file, load_arrays, new_folder, read_object
+from envs.errors import DataError, shown
+from envs.registry import WORLDS
+from mgpo_jax.files import hash_file, new_folder, write_arrays, write_json
+from mgpo_jax.schema import (
+    STRICT,
+    ArrayField,
+    Json,
+    Name,
+    Sha256,
+    Sizes,
+    checked_entry,
+    fitted_arrays,
+    read_arrays,
+    read_document,
+)
+from mgpo_jax.settings import Count, Index, Seed
 
 FORMAT = 2  # 1 had neither rewards nor last observations, and called achieved goals "goals"
 ARRAYS = "trajectories.npz"
 MANIFEST = "manifest.json"
+SIZES: Sizes = {"trajectory": range(1, 2**31), "step": range(1, 2**31)}
 STEP_ARRAYS = Trajectory._fields[:-1]  # those with a row for every step
 
 
@@ -86,110 +102,143 @@ def hash_task(fingerprint: np.ndarray) -> np.uint64:
 
 def save_dataset(folder: Path, dataset: Dataset, manifest: dict[str, Any]) -> None:
     """Write a dataset; the folder appears only when it is complete."""
-    with new_folder(Path(folder)) as partial:
-        np.savez_compressed(partial / ARRAYS, allow_pickle=False, **dataset.arrays)
-        manifest = {
-            "format": FORMAT,
-            "sha256": hash_file(partial / ARRAYS),
-            "num_trajectories": len(dataset),
-            "num_steps": int(dataset.lengths.sum()),
-            **manifest,
-        }
-        (partial / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n")
+    with new_folder(Path(folder)) as place:
+        write_dataset(place, dataset, manifest)
 
 
-def load_dataset(folder: Path, spec: EnvSpec | None = None) -> tuple[Dataset, dict[str, Any]]:
+def write_dataset(place: Path, dataset: Dataset, manifest: dict[str, Any]) -> None:
+    """Write the files of a dataset into a folder."""
+    write_arrays(place / ARRAYS, dataset.arrays)
+    facts = {
+        "format": FORMAT,
+        "sha256": hash_file(place / ARRAYS),
+        "num_trajectories": len(dataset),
+        "num_steps": int(dataset.lengths.sum()),
+    }
+    write_json(place / MANIFEST, {**facts, **manifest})
+
+
+class _Manifest(BaseModel):
+    """What is known of the entries of ``manifest.json``; there may be others."""
+
+    model_config = {**STRICT, "extra": "ignore"}
+
+    format: int
+    sha256: Sha256
+    num_trajectories: Count | None = None
+    num_steps: Count | None = None
+    env: Name | None = None
+    policy: Name | None = None
+    settings: dict[str, Json] = {}
+    seed: Seed | None = None
+    versions: dict[str, str] = {}
+    tried_again: Index = 0
+    failed_episodes: Index = 0
+    dropped_test_tasks: Index = 0
+    length: dict[str, Json] = {}
+    at_horizon: Annotated[float, Ge(0), Le(1)] = 0
+    hindsight_return: dict[str, Json] = {}
+
+
+def load_dataset(
+    folder: Path, spec: EnvSpec | None = None, made: Mapping[str, Any] | None = None
+) -> tuple[Dataset, dict[str, Any]]:
     """Read a dataset and its manifest.
 
     Args:
       folder: where ``save_dataset`` wrote it.
       spec: the world it must fit.
+      made: what must not be contradicted by the manifest, such as ``env``, ``policy``, ``seed`` and
+        ``num_trajectories``.
 
     Raises:
       DataError: if it is missing, damaged, holds NaN or belongs to another world.
     """
     folder = Path(folder)
-    remake = f"remove {folder} and collect it again"
+    path, mend = folder / ARRAYS, f"remove {folder} and collect it again"
     if not (folder / MANIFEST).is_file():
-        raise DataError(f"no dataset in {folder} ({MANIFEST} is missing)")
-    manifest = read_object(folder / MANIFEST, remake)
-    if manifest.get("format") not in (1, FORMAT):
+        raise DataError(f"no dataset in {folder} ({MANIFEST} is missing); {mend}")
+    document, manifest = _read_manifest(folder / MANIFEST, made or {}, mend)
+    if not path.is_file() or hash_file(path) != manifest.sha256:
+        raise DataError(f"{path} is missing or differs from the hash in its manifest; {mend}")
+    fields = _fields(spec)
+    if manifest.format == 1:
+        fields["goals"] = fields.pop("achieved_goals")
+    counted = {"trajectory": manifest.num_trajectories, "step": manifest.num_steps}
+    sizes = {axis: size for axis, size in counted.items() if size is not None}
+    arrays = read_arrays(path, fields, {**SIZES, **sizes}, mend)
+    if manifest.format == 1:
+        arrays["achieved_goals"] = arrays.pop("goals")
+    dataset = Dataset(**arrays)
+    _check_lengths(dataset, path, mend)
+    return dataset, document
+
+
+def _read_manifest(
+    path: Path, made: Mapping[str, Any], mend: str
+) -> tuple[dict[str, Any], _Manifest]:
+    """The manifest of a dataset, as it is and as far as it is known."""
+    document = read_document(path, dict[str, Json], mend)
+    manifest: _Manifest = checked_entry(document, _Manifest, path, "", mend)
+    if manifest.format not in (1, FORMAT):
         raise DataError(
-            f"{folder} has format {manifest.get('format')}, this version reads 1 and {FORMAT}; "
-            f"{remake}"
+            f"{path} has format {manifest.format}, this version reads 1 and {FORMAT}; {mend}"
         )
-    path = folder / ARRAYS
-    if not path.is_file() or hash_file(path) != manifest.get("sha256"):
-        raise DataError(f"{path} is missing or differs from the hash in its manifest; {remake}")
+    for name, wanted in made.items():
+        found = document.get(name, wanted)
+        if found != wanted and not (name == "env" and _same_data(found, wanted, path)):
+            raise DataError(f"{path}: {name} is {shown(found)}, wanted {shown(wanted)}; {mend}")
+    return document, manifest
+
+
+def _same_data(first: str, second: str, where: Path) -> bool:
+    """Whether two worlds share their datasets."""
     try:
-        arrays = load_arrays(path)
-        if manifest["format"] == 1:
-            arrays["achieved_goals"] = arrays.pop("goals")
-        dataset = Dataset(**arrays)
-    except (DataError, KeyError, TypeError):
-        raise DataError(f"{path} does not hold the arrays of a dataset; {remake}") from None
-    check_dataset(dataset, path, spec)
-    return dataset, manifest
+        homes = {WORLDS.known(name, where, "--env").home for name in (first, second)}
+    except DataError:
+        return False
+    return len(homes) == 1
+
+
+def _fields(spec: EnvSpec | None) -> dict[str, ArrayField]:
+    """What the arrays of a dataset must look like, in a world or in any."""
+    if spec is None:
+        obs = ArrayField(("step", ...), "anything")
+        actions = ArrayField(("step", ...), "numbers")
+        goals, horizon = ArrayField(("step", "goal"), "float32"), None
+    else:
+        obs = ArrayField(("step", *spec.obs.shape), spec.obs.dtype)
+        actions = (
+            ArrayField(("step",), "int32", low=0, high=spec.action_dim - 1)
+            if spec.discrete
+            else ArrayField(("step", spec.action_dim), "float32", low=-1, high=1)
+        )
+        goals, horizon = ArrayField(("step", spec.goal_dim), "float32"), spec.horizon
+    return {
+        "lengths": ArrayField(("trajectory",), "int32", low=1, high=horizon),
+        "obs": obs,
+        "actions": actions,
+        "achieved_goals": goals,
+        "goal_reached": ArrayField(("step",), "bool"),
+        "outcomes": goals,
+        "task_hashes": ArrayField(("trajectory",), "uint64", required=False),
+        "rewards": ArrayField(("step",), "float32", required=False),
+        "last_obs": replace(obs, shape=("trajectory", *obs.shape[1:]), required=False),
+    }
 
 
 def check_dataset(dataset: Dataset, where: Path | str, spec: EnvSpec | None = None) -> None:
-    """Raise ``DataError`` with the first thing that is wrong with a dataset."""
-    lengths = dataset.lengths
-    if lengths.ndim != 1 or not np.issubdtype(lengths.dtype, np.integer):
-        raise DataError(f"{where}: lengths must be a list of integers")
-    if dataset.task_hashes is not None and dataset.task_hashes.shape != lengths.shape:
-        hashes = dataset.task_hashes.size
-        raise DataError(f"{where}: {hashes} task hashes for {len(dataset)} trajectories")
-    if len(dataset) == 0 or lengths.min() < 1:
-        raise DataError(f"{where}: every trajectory needs at least one step")
-    total = int(lengths.sum())
-    for name, array in dataset.arrays.items():
-        by_trajectory = name in ("lengths", "task_hashes", "last_obs")
-        if array.ndim == 0 or len(array) != (len(dataset) if by_trajectory else total):
-            raise DataError(
-                f"{where}: {name} has shape {list(array.shape)}, the lengths add up to {total} steps "
-                f"of {len(dataset)} trajectories"
-            )
-        if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
-            row = int(np.argwhere(~np.isfinite(array))[0][0])
-            of = "trajectory" if by_trajectory else "step"
-            raise DataError(f"{where}: {name} holds NaN or infinity, first at {of} {row}")
-    if spec is not None:
-        _check_fit(dataset, where, spec)
+    """Raise ``DataError`` with the first thing that is wrong with a dataset in memory."""
+    fitted_arrays(dataset.arrays, _fields(spec), where, SIZES)
+    _check_lengths(dataset, where)
 
 
-def _check_fit(dataset: Dataset, where: Path | str, spec: EnvSpec) -> None:
-    """Raise ``DataError`` if a dataset cannot be of a world."""
-    obs: Any = np.floating if spec.obs.is_float else np.dtype(spec.obs.dtype)
-    expected: dict[str, tuple[tuple[int, ...], Any]] = {
-        "obs": (spec.obs.shape, obs),
-        "last_obs": (spec.obs.shape, obs),
-        "actions": ((), np.integer) if spec.discrete else ((spec.action_dim,), np.floating),
-        "achieved_goals": ((spec.goal_dim,), np.floating),
-        "goal_reached": ((), np.bool_),
-        "outcomes": ((spec.goal_dim,), np.floating),
-        "rewards": ((), np.floating),
-    }
-    for name, (shape, kind) in expected.items():
-        if name not in dataset.arrays:
-            continue
-        array = dataset.arrays[name]
-        if array.shape[1:] != shape or not np.issubdtype(array.dtype, kind):
-            raise DataError(
-                f"{where}: {name} is {array.dtype}{list(array.shape[1:])} a step, "
-                f"{spec.name} needs {getattr(kind, '__name__', kind)}{list(shape)}"
-            )
-    if spec.discrete and not (
-        0 <= dataset.actions.min() <= dataset.actions.max() < spec.action_dim
-    ):
-        raise DataError(f"{where}: actions must lie in 0..{spec.action_dim - 1}")
-    if not spec.discrete and np.abs(dataset.actions).max() > 1:
-        raise DataError(f"{where}: actions must lie in [-1, 1]; clip them")
-    if dataset.lengths.max() > spec.horizon:
-        raise DataError(
-            f"{where}: a trajectory has {dataset.lengths.max()} steps, "
-            f"the horizon of {spec.name} is {spec.horizon}"
-        )
+def _check_lengths(dataset: Dataset, where: Path | str, mend: str = "") -> None:
+    """Raise ``DataError`` if the lengths do not add up to the steps."""
+    total, steps = int(dataset.lengths.sum(dtype=np.int64)), len(dataset.actions)
+    if total != steps:
+        tail = f"; {mend}" if mend else ""
+        raise DataError(f"{where}: the lengths add up to {total} steps, found {steps}{tail}")
 
 
 class BatchPlan(NamedTuple):

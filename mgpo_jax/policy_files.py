@@ -7,50 +7,84 @@ the weights, how they were made) and, beside them, whatever the release adds.
 from __future__ import annotations
 
 import dataclasses
-import json
+import re
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
+from pydantic import BaseModel
 
 from envs.base import ArraySpec, EnvSpec
-from envs.errors import DataError, UsageError
+from envs.errors import DataError, UsageError, shown
 from envs.registry import World, find
 from mgpo_jax.distributions import HEADS
 from mgpo_jax.encoders import ENCODERS
-from mgpo_jax.files import hash_file, load_arrays, read_object
+from mgpo_jax.files import hash_file, new_folder, write_arrays, write_json
 from mgpo_jax.policy import LoadedPolicy, check_fits
 from mgpo_jax.prompts import single_goal
+from mgpo_jax.released import released_folder
+from mgpo_jax.schema import (
+    STRICT,
+    ArrayField,
+    Json,
+    Name,
+    Sha256,
+    array_names,
+    checked_entry,
+    read_arrays,
+    read_document,
+)
+from mgpo_jax.settings import Index
 from mgpo_jax.transformer import GoalTransformer, TransformerConfig
 
 FORMAT = 2  # 1 had flat observations of size obs_dim
 WEIGHTS = "weights.npz"
 CONFIG = "config.json"
-RELEASED = Path(__file__).parent / "pretrained"
-"""Where the released policies and test tasks of the worlds lie."""
+MEND = "give the folder of another policy, or train it again"
+DTYPES = (
+    "bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64",
+    "float16", "float32", "float64",
+)  # fmt: skip
+"""Of observations."""
 
 
 def save_policy(folder: Path, config: TransformerConfig, params: Any, made: dict[str, Any]) -> None:
-    """Write a released policy; ``made`` tells how (environment, command, results)."""
+    """Write a policy, which replaces one that is there.
+
+    A folder holds a whole policy or none, whenever the process is killed.
+
+    Args:
+      folder: where to.
+      config: the network.
+      params: its weights.
+      made: how it was made (environment, command, results).
+
+    Raises:
+      DataError: if a weight is not finite.
+    """
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    flat = flatten_dict(params, sep="/")
-    np.savez(folder / WEIGHTS, allow_pickle=False, **{k: np.asarray(v) for k, v in flat.items()})
-    document = {
-        "format": FORMAT,
-        "sha256": hash_file(folder / WEIGHTS),
-        "network": dataclasses.asdict(config),
-        "made": made,
-    }
-    (folder / CONFIG).write_text(json.dumps(document, indent=2) + "\n")
+    arrays = {name: np.asarray(leaf) for name, leaf in flatten_dict(params, sep="/").items()}
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise DataError(f"{folder} is not written: weight {name} holds NaN or infinity")
+    document = {"format": FORMAT, "network": dataclasses.asdict(config), "made": made}
+    if not folder.exists():
+        with new_folder(folder) as partial:
+            _write_policy(partial, arrays, document)
+        return
+    (folder / CONFIG).unlink(missing_ok=True)  # without it, a folder holds no policy
+    _write_policy(folder, arrays, document)
 
 
-def released_folder(world: World) -> Path:
-    """Where the released policy and the test tasks of a world lie."""
-    return RELEASED / world.home
+def _write_policy(
+    folder: Path, arrays: Mapping[str, np.ndarray], document: Mapping[str, Any]
+) -> None:
+    write_arrays(folder / WEIGHTS, arrays, compressed=False)
+    write_json(folder / CONFIG, {**document, "sha256": hash_file(folder / WEIGHTS)})
 
 
 def load_policy(world: World | str, path: Path | str | None = None) -> LoadedPolicy:
@@ -85,60 +119,95 @@ def read_policy(folder: Path, spec: EnvSpec | None = None) -> LoadedPolicy:
             f"no policy in {folder} ({CONFIG} is missing); give the folder of one with --policy or "
             "train one with `python -m experiments.pretrain`"
         )
-    config, document = _read_config(folder)
-    path = folder / WEIGHTS
-    if not path.is_file() or hash_file(path) != document.get("sha256"):
-        raise DataError(f"{path} is missing, truncated or differs from the hash in {CONFIG}")
-    flat = load_arrays(path)
-    _check_weights(path, flat, flatten_dict(_shapes(config), sep="/"))
-    if spec is not None:
-        check_fits(config, spec, f"the policy in {folder}")
-    params = jax.tree.map(jnp.asarray, unflatten_dict(flat, sep="/"))
-    return LoadedPolicy(config, params, document["made"], document["sha256"], folder)
-
-
-def _read_config(folder: Path) -> tuple[TransformerConfig, dict[str, Any]]:
-    """The network in the config of a policy, and the whole config."""
-    path = folder / CONFIG
-    document = read_object(path)
-    if document.get("format") not in (1, FORMAT):
+    document = _read_config(folder)
+    network, path = document.network, folder / WEIGHTS
+    if not path.is_file() or hash_file(path) != document.sha256:
         raise DataError(
-            f"{folder} has format {document.get('format')}, this version reads 1 and {FORMAT}"
+            f"{path} is missing, truncated or differs from the hash in {CONFIG}; {MEND}"
         )
-    try:
-        network = dict(document["network"])
-        document["made"]
-        if document["format"] == 1:
-            network["obs_shape"] = [network.pop("obs_dim")]
-        lists = {name: tuple(value) for name, value in network.items() if isinstance(value, list)}
-        config = TransformerConfig(**{**network, **lists})
-        size = ArraySpec(tuple(config.obs_shape), config.obs_dtype).size
-        np.dtype(config.obs_dtype)
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{path} is not the config of a policy ({error})") from None
+    _check_blocks(path, network)
+    fields = {
+        name: ArrayField(like.shape, str(like.dtype))
+        for name, like in flatten_dict(_shapes(network), sep="/").items()
+    }
+    flat = read_arrays(path, fields, mend=MEND, only=True)
+    if spec is not None:
+        check_fits(network, spec, f"the policy in {folder}")
+    params = jax.tree.map(jnp.asarray, unflatten_dict(flat, sep="/"))
+    return LoadedPolicy(network, params, document.made, document.sha256, folder)
+
+
+class _Document(BaseModel):
+    """The ``config.json`` of a policy."""
+
+    model_config = STRICT
+
+    format: int
+    sha256: Sha256
+    network: dict[str, Json]
+    made: dict[str, Json]
+
+
+class _Made(BaseModel):
+    """What is known of the entries of ``made``; there may be others."""
+
+    model_config = {**STRICT, "extra": "ignore"}
+
+    env: Name | None = None
+    config: dict[str, Json] | None = None
+    steps: Index | None = None
+
+
+class _Config(NamedTuple):
+    network: TransformerConfig
+    made: dict[str, Any]
+    sha256: str
+
+
+def _read_config(folder: Path) -> _Config:
+    """The config of a policy."""
+    path = folder / CONFIG
+    document: _Document = read_document(path, _Document, MEND)
+    if document.format not in (1, FORMAT):
+        raise DataError(
+            f"{path} has format {document.format}, this version reads 1 and {FORMAT}; {MEND}"
+        )
+    network = document.network
+    if document.format == 1 and "obs_dim" in network:
+        network = {**network, "obs_shape": [network["obs_dim"]]}
+        del network["obs_dim"]
+    config = checked_entry(network, TransformerConfig, path, "network", MEND)
+    checked_entry(document.made, _Made, path, "made", MEND)
+    if said := _fault(config):
+        raise DataError(f"{path}: network.{said}; {MEND}")
+    return _Config(config, document.made, document.sha256)
+
+
+def _fault(config: TransformerConfig) -> str | None:
+    """What of a network does not fit together, after its types and ranges have been found right."""
     if config.head not in HEADS:
-        raise DataError(f"{path} has the unknown head {config.head!r}")
+        return f"head must be one of {', '.join(HEADS)}, found {shown(config.head)}"
     if config.encoder not in ENCODERS:
-        raise DataError(f"{path} has the unknown encoder {config.encoder!r}")
+        return f"encoder must be one of {', '.join(ENCODERS)}, found {shown(config.encoder)}"
+    if config.obs_dtype not in DTYPES:
+        return f"obs_dtype must be one of {', '.join(DTYPES)}, found {shown(config.obs_dtype)}"
+    if config.embed_dim % config.num_heads:
+        return f"num_heads must divide embed_dim {config.embed_dim}, found {config.num_heads}"
+    size = ArraySpec(config.obs_shape, config.obs_dtype).size
     for name in ("obs_mean", "obs_std"):
-        values = getattr(config, name)
-        if len(values) not in (0, size) or not np.isfinite(values).all():
-            raise DataError(f"{path}: {name} must hold {size} finite numbers, or none")
-    return config, document
+        if len(getattr(config, name)) not in (0, size):
+            return f"{name} must hold {size} numbers or none, found {len(getattr(config, name))}"
+    return None
 
 
-def _check_weights(path: Path, flat: dict[str, np.ndarray], expected: dict[str, Any]) -> None:
-    """Raise ``DataError`` for the first array that is missing, foreign, misshapen or not finite."""
-    for name in sorted(expected.keys() | flat.keys()):
-        if name not in flat or name not in expected:
-            raise DataError(
-                f"{path}: weight {name} is {'missing' if name in expected else 'foreign'}"
-            )
-        if flat[name].shape != expected[name].shape:
-            found, want = list(flat[name].shape), list(expected[name].shape)
-            raise DataError(f"{path}: weight {name} has shape {found}, the network needs {want}")
-        if not np.isfinite(flat[name]).all():
-            raise DataError(f"{path}: weight {name} holds NaN or infinity")
+def _check_blocks(path: Path, config: TransformerConfig) -> None:
+    """Raise ``DataError`` for another number of blocks in the weights, before a network is built for it."""
+    names = (re.match(r"params/blocks_(\d+)/", name) for name in array_names(path, MEND))
+    found = len({match[1] for match in names if match})
+    if found != config.num_layers:
+        raise DataError(
+            f"{path} has the weights of {found} blocks, {CONFIG} has num_layers {config.num_layers}; {MEND}"
+        )
 
 
 def _shapes(config: TransformerConfig) -> Any:

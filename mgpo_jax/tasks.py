@@ -5,6 +5,7 @@ A set of N tasks is one pytree whose leaves are stacked on a leading axis.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -12,16 +13,19 @@ from typing import Any
 import jax
 import numpy as np
 
-from envs.base import Environment, Task, check_shapes
+from envs.base import Environment, Task
 from envs.errors import DataError, UsageError
 from envs.registry import World, find
 from mgpo_jax.dataset import hash_task
-from mgpo_jax.files import load_arrays
-from mgpo_jax.policy_files import released_folder
+from mgpo_jax.files import write_arrays
+from mgpo_jax.released import released_folder
+from mgpo_jax.schema import ArrayField, Sizes, fitted_arrays, read_arrays
 from mgpo_jax.trees import named_leaves
 
 # Streams of task seeds that never meet: test, evaluation while training; data seeds count from 0.
 TEST_SEED, EVAL_SEED = 1_000_003, 1_000_033
+NUM_TASKS: Sizes = {"task": range(1, 100_001)}
+"""How many tasks a file may hold."""
 
 
 def sample_tasks(env: Environment, seed: int, num: int) -> Task:
@@ -51,7 +55,7 @@ def test_tasks(world: World | str) -> Task:
     env, released = world.make(), released_folder(world) / "tasks.npz"
     if released.is_file():
         # They were checked when they were released; whether each can be solved is not computed again.
-        return tasks_from(load_arrays(released), env, released, trusted=True)
+        return _assembled(read_arrays(released, task_fields(env), NUM_TASKS), env)
     return benchmark_tasks(env, world.num_test_tasks)
 
 
@@ -86,25 +90,44 @@ def task_arrays(tasks: Task) -> dict[str, np.ndarray]:
     return {name: np.asarray(leaf) for name, leaf in named_leaves(tasks, "task").items()}
 
 
+def task_fields(env: Environment) -> dict[str, ArrayField]:
+    """What the arrays of a set of tasks must look like."""
+    example = jax.eval_shape(env.sample_task, jax.random.key(0))
+    return {
+        name: ArrayField(("task", *like.shape), str(like.dtype))
+        for name, like in named_leaves(example, "task").items()
+    }
+
+
 def save_tasks(path: Path, tasks: Task) -> None:
-    np.savez_compressed(path, allow_pickle=False, **task_arrays(tasks))
+    """Write tasks to an npz file with one array for each field of the world's task."""
+    write_arrays(Path(path), task_arrays(tasks))
+
+
+MEND = "mend that task or leave it out"
 
 
 def load_tasks(path: Path, env: Environment) -> Task:
-    """Read tasks from an npz file with one array for each field of the world's task.
+    """Read tasks that ``save_tasks`` wrote, or that were made elsewhere.
 
     Raises:
       UsageError: if there is no such file.
-      DataError: if it cannot be read or holds something that is no task.
+      DataError: if it cannot be read or holds something that is no task, or one that nobody can solve.
     """
     path = Path(path)
     if not path.is_file():
-        raise UsageError(f"no task file {path}")
-    return tasks_from(load_arrays(path), env, path)
+        raise UsageError(f"no task file {path}; name an npz file of tasks with --tasks")
+    fields = task_fields(env)
+    tasks = _checked(read_arrays(path, fields, NUM_TASKS, _needs(env, fields)), env, path)
+    try:
+        env.check_solvable(tasks)
+    except ValueError as error:
+        raise DataError(f"{path}: {error}; {MEND}") from None
+    return tasks
 
 
 def tasks_from(
-    arrays: dict[str, np.ndarray], env: Environment, where: Path | str, trusted: bool = False
+    arrays: Mapping[str, np.ndarray], env: Environment, where: Path | str, trusted: bool = False
 ) -> Task:
     """A set of tasks from arrays by the names of their fields.
 
@@ -118,22 +141,27 @@ def tasks_from(
       DataError: if an array is missing or holds something that is no task; the message begins with
         ``where``.
     """
-    example: Any = jax.eval_shape(env.sample_task, jax.random.key(0))
-    names = list(named_leaves(example, "task"))
-    if missing := [name for name in names if name not in arrays]:
-        raise DataError(
-            f"{where} lacks {', '.join(missing)}; tasks of {env.spec.name} need the arrays "
-            f"{', '.join(names)}"
-        )
-    leaves = [arrays[name] for name in names]
-    if any(array.ndim == 0 or len(array) == 0 for array in leaves):
-        raise DataError(f"{where} holds no tasks")
-    tasks = jax.tree.unflatten(jax.tree.structure(example), leaves)
+    fields = task_fields(env)
+    fitted = fitted_arrays(arrays, fields, where, NUM_TASKS, _needs(env, fields))
+    return _assembled(fitted, env) if trusted else _checked(fitted, env, where)
+
+
+def _needs(env: Environment, fields: Mapping[str, ArrayField]) -> str:
+    return f"tasks of {env.spec.name} need the arrays {', '.join(fields)}"
+
+
+def _assembled(arrays: Mapping[str, np.ndarray], env: Environment) -> Task:
+    """The arrays of all fields as the world's record."""
+    example = jax.eval_shape(env.sample_task, jax.random.key(0))
+    leaves = [arrays[name] for name in named_leaves(example, "task")]
+    return jax.tree.unflatten(jax.tree.structure(example), leaves)
+
+
+def _checked(arrays: Mapping[str, np.ndarray], env: Environment, where: Path | str) -> Task:
+    """The tasks, after the world has found nothing wrong with them."""
+    tasks = _assembled(arrays, env)
     try:
-        if trusted:
-            check_shapes(tasks, example)
-        else:
-            env.check_task(tasks)
+        env.check_task(tasks)
     except ValueError as error:
-        raise DataError(f"{where}: {error}") from None
-    return jax.tree.map(lambda array, like: array.astype(like.dtype), tasks, example)
+        raise DataError(f"{where}: {error}; {MEND}") from None
+    return tasks

@@ -15,11 +15,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from annotated_types import Ge, Gt, Le, MaxLen
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from envs.base import EnvSpec
@@ -27,23 +28,30 @@ from envs.errors import nearest
 from mgpo_jax.distributions import HEADS, Distribution
 from mgpo_jax.encoders import ENCODERS
 from mgpo_jax.prompts import Prompt
+from mgpo_jax.schema import STRICT
+from mgpo_jax.settings import NumGoals, NumLayers, Share, Width
 
 # Attention over the keys of one query block at a time: never the full score matrix.
 QUERY_BLOCK = 128
 OBS_LIMIT = 5.0  # standard deviations; an observation farther out counts as this far
 
 
+Size = Annotated[int, Ge(1), Le(1_000_000)]
+
+
 @dataclass(frozen=True)
 class TransformerConfig:
     """Sizes of the network. Defaults are Table 6 of the paper."""
 
-    obs_shape: tuple[int, ...]
+    __pydantic_config__ = STRICT
+
+    obs_shape: Annotated[tuple[Size, ...], MaxLen(8)]
     """Shape of an observation."""
-    goal_dim: int
+    goal_dim: Size
     """Size G of a goal."""
-    action_dim: int
+    action_dim: Size
     """Number of discrete actions, or size A of a continuous action."""
-    horizon: int
+    horizon: Size
     """Largest number of steps T of an episode."""
     obs_dtype: str = "float32"
     """Dtype of an observation."""
@@ -51,19 +59,19 @@ class TransformerConfig:
     """How observations become tokens, one of ``encoders.ENCODERS``."""
     head: str = "categorical"
     """The action distribution, one of ``distributions.HEADS``."""
-    max_prompt_length: int = 5
+    max_prompt_length: NumGoals = 5
     """K, the number of prompt slots."""
-    embed_dim: int = 128
-    num_layers: int = 3
-    num_heads: int = 1
-    dropout: float = 0.1
+    embed_dim: Width = 128
+    num_layers: NumLayers = 3
+    num_heads: Width = 1
+    dropout: Share = 0.1
     """Rate on embeddings, attention weights and residual branches."""
     prompt_order: bool = True
     """Whether prompt slots carry a position embedding (the paper's network: False)."""
-    obs_mean: tuple[float, ...] = ()
+    obs_mean: tuple[Annotated[float, Ge(-1e18), Le(1e18)], ...] = ()
     """Mean of every component of an observation in training, in the order of the flattened observation,
     where observations are standardized (empty: they are not)."""
-    obs_std: tuple[float, ...] = ()
+    obs_std: tuple[Annotated[float, Gt(0), Le(1e18)], ...] = ()
     """Standard deviation of every component, likewise."""
 
 

@@ -246,9 +246,12 @@ def truncate_and_sign(folder):
 FILE_DAMAGE = {
     "changed byte": (flip_byte, "differs from the hash.*collect it again"),
     "truncated": (truncate_file, "differs from the hash.*collect it again"),
-    "truncated and signed": (truncate_and_sign, "does not hold the arrays.*collect it again"),
+    "truncated and signed": (truncate_and_sign, "is not a readable npz file; .*collect it again"),
     "no arrays": (lambda f: (f / ARRAYS).unlink(), "is missing.*collect it again"),
-    "no manifest": (lambda f: (f / MANIFEST).unlink(), "no dataset in .*manifest.json is missing"),
+    "no manifest": (
+        lambda f: (f / MANIFEST).unlink(),
+        "no dataset in .*manifest.json is missing.*collect it again",
+    ),
     "manifest is no JSON": (
         lambda f: (f / MANIFEST).write_text("{"),
         "not readable JSON.*collect it again",
@@ -258,6 +261,26 @@ FILE_DAMAGE = {
         "not readable JSON.*collect it again",
     ),
     "other format": (lambda f: sign(f, format=99), "has format 99, this version reads 1 and 2"),
+    "no format": (lambda f: sign(f, format=True), "format must be an integer, found True"),
+    "another count": (
+        lambda f: sign(f, num_trajectories=5),
+        r"lengths has shape \[4\], wanted \[trajectory 5\]; .*collect it again",
+    ),
+    "another number of steps": (
+        lambda f: sign(f, num_steps=1),
+        r"obs has shape \[17, 2\], wanted \[step 1, 2\]; .*collect it again",
+    ),
+    "a path for a world": (lambda f: sign(f, env="../../x"), "env is none that can stand here"),
+    "a seed in words": (lambda f: sign(f, seed="seven"), "seed must be an integer, found 'seven'"),
+    "NaN among the facts": (
+        lambda f: sign(f, at_horizon=float("nan")),
+        "at_horizon must be a finite number, found nan",
+    ),
+    "nested without end": (
+        lambda f: (f / MANIFEST).write_text("[" * 5000),
+        "not readable JSON.*collect it again",
+    ),
+    "a list": (lambda f: (f / MANIFEST).write_text("[]"), "does not hold a JSON object"),
 }
 
 
@@ -277,78 +300,89 @@ def test_no_folder(tmp_path):
 ARRAY_DAMAGE = {
     "missing array": (
         lambda a: a.pop("achieved_goals"),
-        "does not hold the arrays.*collect it again",
+        "lacks achieved_goals.*collect it again",
     ),
-    "unknown array": (lambda a: a.update(x=a["obs"]), "does not hold the arrays"),
-    "NaN": (lambda a: a["obs"].__setitem__((5, 1), np.nan), "obs holds NaN .*first at step 5"),
+    "NaN": (lambda a: a["obs"].__setitem__((5, 1), np.nan), "obs holds NaN at step 5"),
     "infinity": (
         lambda a: a["achieved_goals"].__setitem__((2, 0), np.inf),
-        "achieved_goals holds NaN or infinity, first at step 2",
+        "achieved_goals holds infinity at step 2",
     ),
     "too few steps": (
         lambda a: a.update(actions=a["actions"][:-1]),
-        "lengths add up to 17 steps",
+        r"goal_reached has shape \[17\], wanted \[step 16\]|actions has shape \[16\], wanted \[step 17\]",
     ),
     "empty trajectory": (
         lambda a: a["lengths"].__setitem__(slice(2), [4, 0]),
-        "every trajectory needs at least one step",
+        "lengths holds 0 at trajectory 1, must be from 1 to 9",
     ),
     "no trajectories": (
         lambda a: a.update({name: array[:0] for name, array in a.items()}),
-        "every trajectory needs at least one step",
+        r"lengths has shape \[0\], wanted \[trajectory",
     ),
     "obs of another world": (
         lambda a: a.update(obs=a["obs"][:, :1]),
-        r"obs is float32\[1\] a step, toy needs floating\[2\]",
+        r"obs has shape \[17, 1\], wanted \[step 17, 2\]",
     ),
     "goals of another world": (
         lambda a: a.update(achieved_goals=a["achieved_goals"][:, :2]),
-        r"achieved_goals is float32\[2\] a step, toy needs floating\[3\]",
+        r"achieved_goals has shape \[17, 2\], wanted \[step 17, 3\]",
     ),
     "goals as in format 1": (
         lambda a: a.update(goals=a.pop("achieved_goals")),
-        "does not hold the arrays.*collect it again",
+        "lacks achieved_goals.*collect it again",
     ),
     "too few rewards": (
         lambda a: a.update(rewards=a["rewards"][1:]),
-        r"rewards has shape \[16\], the lengths add up to 17 steps of 4 trajectories",
+        r"rewards has shape \[16\], wanted \[step 17\]",
     ),
     "NaN after the last action": (
         lambda a: a["last_obs"].__setitem__((3, 0), np.nan),
-        "last_obs holds NaN or infinity, first at trajectory 3",
+        "last_obs holds NaN at trajectory 3",
     ),
     "a last observation for every step": (
         lambda a: a.update(last_obs=a["obs"]),
-        r"last_obs has shape \[17, 2\], .* of 4 trajectories",
+        r"last_obs has shape \[17, 2\], wanted \[trajectory 4, 2\]",
     ),
     "continuous actions": (
         lambda a: a.update(actions=a["actions"].astype(np.float32)),
-        r"actions is float32\[\] a step, toy needs integer\[\]",
+        "actions must hold integers, found float32",
     ),
     "goal_reached as numbers": (
         lambda a: a.update(goal_reached=a["goal_reached"].astype(np.int32)),
-        "goal_reached is int32",
+        "goal_reached must hold booleans, found int32",
     ),
     "action too large": (
         lambda a: a["actions"].__setitem__(3, 4),
-        r"actions must lie in 0\.\.3",
+        "actions holds 4 at step 3, must be from 0 to 3",
     ),
-    "negative action": (lambda a: a["actions"].__setitem__(3, -1), "actions must lie in"),
+    "negative action": (lambda a: a["actions"].__setitem__(3, -1), "actions holds -1 at step 3"),
     "missing hashes": (
         lambda a: a.update(task_hashes=a["task_hashes"][:1]),
-        "1 task hashes for",
+        r"task_hashes has shape \[1\], wanted \[trajectory 4\]",
     ),
     "fractional lengths": (
         lambda a: a.update(lengths=a["lengths"].astype(np.float32)),
-        "lengths must be a list of integers",
+        "lengths must hold integers, found float32",
     ),
     "too long": (
-        lambda a: a.update(
-            lengths=np.array([3, 14], np.int32),
-            task_hashes=a["task_hashes"][:2],
-            last_obs=a["last_obs"][:2],
-        ),
-        "a trajectory has 14 steps, the horizon of toy is 9",
+        lambda a: a.update(lengths=np.array([3, 10, 3, 1])),
+        "lengths holds 10 at trajectory 1, must be from 1 to 9",
+    ),
+}
+
+
+ARRAY_DAMAGE |= {
+    "dates": (
+        lambda a: a.update(actions=a["actions"].astype("m8[s]")),
+        "actions must hold integers, found timedelta64",
+    ),
+    "numbers without sense": (
+        lambda a: a["obs"].__setitem__((0, 1), 1e38),
+        r"obs holds 1e\+38 at step 0, must be from -1e\+18 to 1e\+18; .*collect it again",
+    ),
+    "other lengths": (
+        lambda a: a["lengths"].__setitem__(0, 4),
+        "the lengths add up to 18 steps, found 17; .*collect it again",
     ),
 }
 
@@ -363,15 +397,53 @@ def test_damaged_arrays(folder, damage):
 
 def test_pickled_arrays_are_never_loaded(folder):
     rewrite(folder, lambda arrays: arrays.update(actions=np.array([{}] * 17, object)))
-    with pytest.raises(DataError, match="does not hold the arrays"):
+    with pytest.raises(DataError, match="actions must hold numbers, found object"):
         load_dataset(folder)
+
+
+@pytest.mark.parametrize(
+    ("manifest", "says"),
+    [
+        ({"env": "gridworld"}, "env is 'gridworld', wanted 'maze15'"),
+        ({"env": "nowhere.such:WORLD"}, "env is 'nowhere.such:WORLD', wanted 'maze15'"),
+        ({"policy": "random"}, "policy is 'random', wanted 'astar4'"),
+        ({"seed": 7}, "seed is 7, wanted 0"),
+    ],
+)
+def test_manifests_that_contradict_what_is_wanted(tmp_path, dataset, manifest, says):
+    made = {"env": "maze15", "policy": "astar4", "seed": 0}
+    save_dataset(tmp_path / "data", dataset, {**made, **manifest})
+    with pytest.raises(DataError, match=f"manifest.json: {says}; remove .* and collect it again"):
+        load_dataset(tmp_path / "data", SPEC, made)
+
+
+def test_worlds_share_the_datasets_of_their_home(tmp_path, dataset):
+    save_dataset(tmp_path / "data", dataset, {"env": "kitchen"})
+    load_dataset(tmp_path / "data", SPEC, {"env": "kitchen-mjx", "seed": 3})
+
+
+def test_datasets_of_foreign_tools_are_converted(folder, dataset):
+    """Doubles, other orders of bytes and axes, and unsigned lengths are the same numbers."""
+
+    def change(arrays):
+        for name in ("obs", "rewards"):
+            arrays[name] = np.asfortranarray(arrays[name].astype(">f8"))
+        arrays["lengths"] = arrays["lengths"].astype(np.uint64)
+        arrays["notes"] = np.array(["not read"])
+
+    rewrite(folder, change)
+    loaded, _ = load_dataset(folder, SPEC)
+    assert_equal(loaded, dataset)
+    assert all(array.flags.c_contiguous for array in loaded.arrays.values())
 
 
 def test_continuous_actions_have_bounds(dataset):
     spec = replace(SPEC, actions=Box(4))
     actions = np.linspace(-1, 1, 17 * 4, dtype=np.float32).reshape(17, 4)
     check_dataset(replace(dataset, actions=actions), "here", spec)
-    with pytest.raises(DataError, match=r"here: actions must lie in \[-1, 1\]"):
+    with pytest.raises(
+        DataError, match=r"here: actions holds -1\.01 at step 0, must be from -1 to 1"
+    ):
         check_dataset(replace(dataset, actions=1.01 * actions), "here", spec)
 
 
@@ -404,7 +476,7 @@ def test_datasets_of_format_1_are_read(folder, dataset):
 def test_a_dataset_of_format_1_without_goals(folder):
     write_format_1(folder)
     rewrite(folder, lambda arrays: arrays.pop("goals"))
-    with pytest.raises(DataError, match=r"does not hold the arrays.*collect it again"):
+    with pytest.raises(DataError, match=r"lacks goals.*collect it again"):
         load_dataset(folder, SPEC)
 
 
@@ -439,9 +511,8 @@ def test_observations_keep_their_shape_and_dtype(tmp_path, dataset):
 @pytest.mark.parametrize(
     ("dtype", "spec", "says"),
     [
-        (np.int32, BYTES, r"obs is int32\[3, 3\] a step, toy needs uint8\[3, 3\]"),
-        (np.float32, BYTES, r"obs is float32\[3, 3\] a step, toy needs uint8\[3, 3\]"),
-        (np.uint8, SPEC, r"obs is uint8\[3, 3\] a step, toy needs floating\[2\]"),
+        (np.float32, BYTES, "obs must hold integers, found float32"),
+        (np.uint8, SPEC, r"obs has shape \[17, 3, 3\], wanted \[step .*, 2\]"),
     ],
 )
 def test_observations_of_another_kind(dataset, dtype, spec, says):

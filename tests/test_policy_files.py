@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,8 +16,9 @@ import pytest
 import envs
 from envs.base import ArraySpec, Box
 from envs.errors import DataError, UsageError
-from mgpo_jax.policy_files import load_policy, read_policy, released_folder, save_policy
+from mgpo_jax.policy_files import load_policy, read_policy, save_policy
 from mgpo_jax.prompts import single_goal
+from mgpo_jax.released import released_folder
 from mgpo_jax.rollout import Query, rollout
 from mgpo_jax.tasks import load_tasks
 from mgpo_jax.transformer import GoalTransformer, TransformerConfig, network_config
@@ -82,21 +84,69 @@ def test_standardization_comes_back(tmp_path: Path, params: dict) -> None:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"obs_mean": [0.0] * 4}, "obs_mean must hold 6 finite numbers"),
-        ({"obs_std": [float("nan")] * 6}, "obs_std must hold 6 finite numbers"),
-        ({"head": "gausian"}, "unknown head 'gausian'"),
-        ({"encoder": "lineal"}, "unknown encoder 'lineal'"),
-        ({"obs_dtype": "uint7"}, "not the config of a policy .*uint7"),
-        ({"obs_shape": "six"}, "not the config of a policy"),
-        ({"obs_shape": 6}, "not the config of a policy"),
-        ({"obs_dim": 6}, "not the config of a policy .*obs_dim"),
+        ({"obs_mean": [0.0] * 4}, "network.obs_mean must hold 6 numbers or none, found 4"),
+        ({"obs_mean": 1.0}, "network.obs_mean must be a list, found 1.0"),
+        ({"obs_std": [float("nan")] * 6}, r"network.obs_std must be a finite number, found \[nan"),
+        ({"obs_std": [0.0] * 6}, "network.obs_std.0 must be above 0, found 0.0"),
+        ({"obs_std": [-1.0] * 6}, "network.obs_std.0 must be above 0, found -1.0"),
+        ({"head": "gausian"}, "network.head must be one of .*mixture.*, found 'gausian'"),
+        ({"encoder": "lineal"}, "network.encoder must be one of linear, found 'lineal'"),
+        ({"obs_dtype": "uint7"}, "network.obs_dtype must be one of .*uint8.*, found 'uint7'"),
+        ({"obs_shape": "six"}, "network.obs_shape must be a list, found 'six'"),
+        ({"obs_shape": 6}, "network.obs_shape must be a list, found 6"),
+        ({"obs_dim": 6}, "has the unknown entry network.obs_dim"),
+        ({"dropout": True}, "network.dropout must be a number, found True"),
+        ({"dropout": 1.5}, "network.dropout must be below 1, found 1.5"),
+        ({"prompt_order": "yes"}, "network.prompt_order must be true or false, found 'yes'"),
+        ({"num_heads": 3}, "network.num_heads must divide embed_dim 8, found 3"),
+        ({"num_heads": 0}, "network.num_heads must be at least 1, found 0"),
+        ({"num_heads": True}, "network.num_heads must be an integer, found True"),
+        ({"num_layers": None}, "network.num_layers must be an integer, found None"),
+        ({"num_layers": 2.5}, "network.num_layers must be an integer, found 2.5"),
+        ({"num_layers": 2}, r"weights.npz has the weights of 1 blocks, .* num_layers 2"),
+        ({"num_layers": 10**6}, "network.num_layers must be at most 256, found 1000000"),
+        ({"num_layers": 10**400}, "network.num_layers must be at most 256, found 1"),
+        ({"embed_dim": 10**12}, "network.embed_dim must be at most 16384, found 1"),
+        ({"horizon": -1}, "network.horizon must be at least 1, found -1"),
     ],
 )
 def test_damaged_network_settings(policy: Path, change: dict, says: str) -> None:
     document = json.loads((policy / "config.json").read_text())
     document["network"] |= change
     (policy / "config.json").write_text(json.dumps(document))
+    began = time.monotonic()
     with pytest.raises(DataError, match=says):
+        read_policy(policy, SPEC)
+    assert time.monotonic() - began < 1
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"format": True}, "config.json: format must be an integer, found True"),
+        ({"network": [1]}, "config.json: network must be an object"),
+        ({"network": None}, "config.json: network must be an object, found None"),
+        ({"made": 7}, "config.json: made must be an object, found 7"),
+        ({"made": {"env": "../../x"}}, r"made.env is none that can stand here, found '../../x'"),
+        ({"made": {"steps": 1.5}}, r"made.steps must be an integer, found 1.5"),
+        ({"sha256": "0"}, "config.json: sha256 is none"),
+        ({"more": 1}, "has the unknown entry more"),
+    ],
+)
+def test_damaged_configs(policy: Path, change: dict, says: str) -> None:
+    document = json.loads((policy / "config.json").read_text())
+    (policy / "config.json").write_text(json.dumps({**document, **change}))
+    with pytest.raises(DataError, match=says + ".*train it again") as caught:
+        read_policy(policy, SPEC)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["format", "network", "made", "sha256"])
+def test_configs_that_lack_an_entry(policy: Path, name: str) -> None:
+    document = json.loads((policy / "config.json").read_text())
+    del document[name]
+    (policy / "config.json").write_text(json.dumps(document))
+    with pytest.raises(DataError, match=f"config.json lacks {name}; .*train it again"):
         read_policy(policy, SPEC)
 
 
@@ -138,9 +188,60 @@ def test_nan_weights(policy: Path) -> None:
         read_policy(policy)
 
 
+@pytest.mark.parametrize(
+    ("weights", "says"),
+    [
+        (np.full(5, 3e38, np.float32), r"head/bias holds 3e\+38 at \[0\], must be from -1e\+18"),
+        (np.zeros(5, complex), "head/bias must hold numbers, found complex128"),
+        (np.zeros(5, bool), "head/bias must hold numbers, found bool"),
+    ],
+)
+def test_weights_that_are_no_numbers(policy: Path, weights: np.ndarray, says: str) -> None:
+    rewrite(policy, **{"params/head/bias": weights})
+    with pytest.raises(DataError, match=says):
+        read_policy(policy)
+
+
+def test_weights_of_a_foreign_tool(policy: Path) -> None:
+    """Big-endian doubles in the order of Fortran are the same weights."""
+    before = read_policy(policy).params["params"]["embed_obs"]["kernel"]
+    foreign = np.asfortranarray(np.asarray(before).astype(">f8"))
+    rewrite(policy, **{"params/embed_obs/kernel": foreign})
+    after = read_policy(policy).params["params"]["embed_obs"]["kernel"]
+    assert after.dtype == before.dtype == np.float32
+    np.testing.assert_array_equal(after, before)
+
+
+def test_a_policy_is_whole_or_absent(
+    policy: Path, params: dict, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether writing it breaks off in a new folder or in that of an older policy."""
+
+    def stop(path: Path) -> str:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("mgpo_jax.policy_files.hash_file", stop)
+    for folder in (policy, policy.with_name("new")):
+        with pytest.raises(KeyboardInterrupt):
+            save_policy(folder, CONFIG, params, {})
+        with pytest.raises(UsageError, match="no policy in"):
+            read_policy(folder)
+    assert not policy.with_name("new").exists()
+    monkeypatch.undo()
+    save_policy(policy, CONFIG, params, {"steps": 1})
+    assert read_policy(policy).made == {"steps": 1}
+
+
+def test_weights_that_are_not_finite_are_not_written(tmp_path: Path, params: dict) -> None:
+    broken = jax.tree.map(lambda leaf: leaf * jnp.nan, params)
+    with pytest.raises(DataError, match=r"policy is not written: weight params/.* holds NaN"):
+        save_policy(tmp_path / "policy", CONFIG, broken, {})
+    assert not list(tmp_path.iterdir())
+
+
 def test_wrong_shape(policy: Path) -> None:
     rewrite(policy, **{"params/head/bias": np.zeros(4, np.float32)})
-    with pytest.raises(DataError, match=r"shape \[4\], the network needs \[5\]"):
+    with pytest.raises(DataError, match=r"head/bias has shape \[4\], wanted \[5\]"):
         read_policy(policy)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
@@ -12,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from made_results import GOALS, SIDE, TINY, made_results, save_format_1
+from made_results import ENV, GOALS, SIDE, TINY, made_results, save_format_1
 
 import envs
 from envs.episodes import replay
@@ -20,55 +21,57 @@ from envs.errors import DataError
 from envs.gridworld.env import GridWorld
 from envs.registry import WORLDS, World
 from experiments.store.metrics import read_metrics
-from experiments.store.results import (
-    Results,
-    load_results,
-    read_summary,
-    results_of,
-    save_results,
-)
-from experiments.store.summary import printed, summarize
-from experiments.store.tables import comparison
+from experiments.store.policies import load_policy_of
+from experiments.store.results import PARTS, Results, load_results, results_of, save_results
+from experiments.store.summary import printed, read_summary, summarize
 from mgpo_jax.policy import LoadedPolicy
+from mgpo_jax.policy_files import read_policy, save_policy
 from mgpo_jax.prompts import single_goal
 from mgpo_jax.runner import adapt
 from mgpo_jax.tasks import sample_tasks, task_at
 from mgpo_jax.transformer import GoalTransformer, network_config
 
 PUBLISHED = sorted((Path(__file__).parents[1] / "results").glob("*/*/results.npz"))
-GRID = World(name="short", make=lambda: GridWorld(name="short", horizon=10))
+GRID = World(name="short", make=lambda: GridWorld(name="short", horizon=60))
 
 
 @pytest.fixture(autouse=True)
 def made_worlds(monkeypatch: pytest.MonkeyPatch) -> None:
     """The worlds that the results below name."""
-    made, find = {"tiny": TINY, "short": GRID}, WORLDS.find
-    monkeypatch.setattr(WORLDS, "find", lambda name: made.get(name) or find(name))
+    for world in (TINY, GRID):
+        monkeypatch.setitem(WORLDS._registered, world.name, world)
+
+
+def with_summary(results: Results, sha256: str = "0" * 64) -> Results:
+    return replace(results, summary=summary_of(results, sha256))
 
 
 def save(folder: Path, results: Results) -> Path:
-    save_results(folder, results)
+    save_results(folder, with_summary(results))
     return folder
 
 
 def assert_equal(found: Results, wanted: Results) -> None:
-    for field in fields(Results):
+    names = {field.name for field in fields(Results)} - {"folder", "summary"}
+    for name in names:
         jax.tree.map(
             np.testing.assert_array_equal,
-            getattr(found, field.name),
-            getattr(wanted, field.name),
+            getattr(found, name),
+            getattr(wanted, name),
             is_leaf=lambda leaf: isinstance(leaf, str),
         )
 
 
 def test_results_survive_the_disk(tmp_path: Path) -> None:
-    results = replace(made_results(), summary={"regret": 0.5})
+    results = made_results()
     folder = save(tmp_path / "run", results)
     loaded = load_results(folder)
     assert_equal(loaded, results)
+    assert loaded.folder == folder
     assert loaded.actions.dtype == np.uint8
     assert loaded.reached.counts.dtype == np.int32
-    assert read_summary(folder) == {"regret": 0.5}
+    assert loaded.summary == read_summary(folder)
+    assert loaded.summary["regret"] == pytest.approx(0.85)
     assert (loaded.env, loaded.method, loaded.optimum_known) == ("tiny", "ucb", True)
     np.testing.assert_allclose(loaded.task_goals, GOALS / SIDE, rtol=1e-6)
     meta = json.loads((folder / "meta.json").read_text())
@@ -121,7 +124,9 @@ def test_the_most_improved_tasks_come_first() -> None:
 
 def test_results_of_the_first_version_are_read(tmp_path: Path) -> None:
     results = made_results(actions=None, reached=None)
-    loaded = load_results(save_format_1(tmp_path / "run", results))
+    folder = save_format_1(tmp_path / "run", results)
+    (folder / "summary.json").write_text(json.dumps(summary_of(results)))
+    loaded = load_results(folder)
     best = {name: array for name, array in results.best.items() if name != "greedy"}
     config = {"env": "tiny", "bandit": "ucb", "policy": None}
     assert_equal(loaded, replace(results, best=best, config=config))
@@ -140,8 +145,6 @@ def test_published_results_are_read(path: Path) -> None:
     goals = results.best_goals(0, num - 1)
     if results.method != "bbt":  # which moves the last goal, too
         np.testing.assert_array_equal(goals[-1], results.task_goals[num - 1])
-    (row,) = comparison([results.summary]).splitlines()[2:]
-    assert f"| {results.env} | {results.method} |" in row
     regret = (results.optimal_returns - results.eval_returns[:, :, -1]).mean()
     assert results.summary["regret"] == pytest.approx(regret, abs=1e-5)
 
@@ -180,30 +183,33 @@ DAMAGES = {
     "no JSON": (overwrite("summary.json", b"{"), r"summary\.json is not readable JSON"),
     "no text": (overwrite("config.json", b"\xff\xfe"), r"config\.json is not readable JSON"),
     "a list": (overwrite("config.json", b"[]"), r"config\.json does not hold a JSON object"),
-    "no world": (overwrite("config.json", b'{"method": "ucb"}'), "does not name the env"),
-    "no method": (overwrite("config.json", b'{"env": "tiny"}'), "does not name the method"),
+    "no world": (overwrite("config.json", b'{"method": "ucb"}'), "lacks env"),
+    "no method": (overwrite("config.json", b'{"env": "tiny"}'), "lacks method"),
     "lacks": (rewrite("results.npz", best__prompt__goals=None), r"lacks best\.prompt\.goals"),
     "lacks the choice": (rewrite("results.npz", choice__greedy=None), r"lacks choice\.greedy"),
     "lacks a number": (rewrite("results.npz", eval_returns=None), "lacks eval_returns"),
     "axes": (
         rewrite("results.npz", best__prompt__mask=np.ones((2, 2, 20, 4), bool)),
-        r"best\.prompt\.mask has shape \[2, 2, 20, 4\], which does not fit the axes SNRP \(.*P 3",
+        r"best\.prompt\.mask has shape \[2, 2, 20, 4\], wanted \[seed 2, task 2, round 20, slot 3\]",
     ),
     "rounds": (
         rewrite("results.npz", choice__greedy=np.ones((2, 2, 19), bool)),
-        r"greedy has shape \[2, 2, 19\], which does not fit the axes SNR\* \(.*R 20",
+        r"has shape \[2, 2, (19|20).*\], wanted \[seed 2, task 2, round (19|20), ",
     ),
     "steps": (
         rewrite("results.npz", actions=np.ones((2, 3, 20, 6), np.uint8)),
-        r"actions has shape \[2, 3, 20, 6\], which does not fit the axes SNET\*",
+        r"actions has shape \[2, 3, 20, 6\], wanted \[seed 2, task 2, episode 20, step, \.\.\.\]",
     ),
     "rank": (rewrite("results.npz", optimal_returns=np.float32(1)), "optimal_returns has shape"),
     "NaN": (rewrite("results.npz", eval_returns=np.full((2, 2, 2), np.nan)), "eval_returns holds"),
-    "other tasks": (rewrite("tasks.npz", goal=np.zeros((3, 2))), r"goal has shape \[3, 2\].* 2 t"),
+    "other tasks": (
+        rewrite("tasks.npz", goal=np.zeros((3, 2))),
+        r"goal has shape \[3, 2\], wanted \[task 2, \.\.\.\]",
+    ),
     "no table": (rewrite("results.npz", reached_table=None), "reached goals are incomplete"),
     "no place": (
         rewrite("results.npz", reached_index=np.full(320, 9, np.uint8)),
-        "reached goals are incomplete",
+        "reached_index holds 9, reached_table has 4 goals",
     ),
     "miscounted": (
         rewrite("results.npz", reached_counts=np.ones((2, 2, 20), np.uint8)),
@@ -212,22 +218,153 @@ DAMAGES = {
 }
 
 
+def configured(**changes: Any) -> Damage:
+    def damage(folder: Path) -> None:
+        path = folder / "config.json"
+        path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+
+    return damage
+
+
+TWO = (2, 2, 20)
+DAMAGES |= {
+    "NaN for an episode": (
+        rewrite("results.npz", eval_episodes=np.array([np.nan, 20])),
+        "eval_episodes must hold integers, found float64",
+    ),
+    "episodes that fall": (
+        rewrite("results.npz", eval_episodes=np.array([20, 1])),
+        r"eval_episodes must ascend from 1 to at most 20, found \[20, 1\]",
+    ),
+    "an episode too many": (
+        rewrite("results.npz", eval_episodes=np.array([1, 2**63 - 1])),
+        r"eval_episodes must ascend from 1 to at most 20",
+    ),
+    "dates": (
+        rewrite("results.npz", returns=np.zeros(TWO, "M8[s]")),
+        r"returns must hold numbers, found datetime64\[s\]",
+    ),
+    "complex goals": (
+        rewrite("results.npz", best__prompt__goals=np.zeros((*TWO, 3, 2), complex)),
+        r"best\.prompt\.goals must hold numbers, found complex128",
+    ),
+    "goals far away": (
+        rewrite("results.npz", best__prompt__goals=np.full((*TWO, 3, 2), 1e10)),
+        r"best\.prompt\.goals holds 1e\+10 at seed 0, task 0, round 0, slot 0, number 0, must be",
+    ),
+    "prompts without a goal": (
+        rewrite("results.npz", best__prompt__mask=np.zeros((*TWO, 3), bool)),
+        r"best\.prompt\.mask leaves no goal at seed 0, task 0, round 0",
+    ),
+    "mazes of words": (
+        rewrite("tasks.npz", maze=np.full((2, 7, 7), "wall")),
+        "maze must hold numbers or booleans, found <U4",
+    ),
+    "another number of seeds": (configured(seeds=3), r"returns has shape .* wanted \[seed 3, task"),
+    "outside": (configured(env="../../x"), r"config\.json: env is none that can stand here"),
+    "an escape": (configured(env="\x1b[31m"), r"env is none that can stand .* '\\x1b\[31m'"),
+    "a long name": (configured(env="x" * 300), "env is none that can stand here"),
+    "an unknown world": (configured(env="tinny"), r"config\.json: unknown world 'tinny'; did you"),
+    "a place": (
+        configured(env="no_such_module:WORLD"),
+        r"names the world 'no_such_module:WORLD', .*; give it with --env no_such_module:WORLD",
+    ),
+    "a method with a slash": (configured(method="u/cb"), "method is none that can stand here"),
+    "a formula": (configured(method=r"$\frac{$"), "method is none that can stand here"),
+    "an unknown method": (configured(method="ucbb"), "unknown method 'ucbb'; did you mean 'ucb'"),
+    "a number for a policy": (configured(policy=3), r"config\.json: policy must be text, found 3"),
+    "a list for a policy": (
+        configured(policy=[]),
+        r"config\.json: policy must be text, found \[\]",
+    ),
+    "no text in meta": (overwrite("meta.json", b"[]"), r"meta\.json does not hold a JSON object"),
+    "of a later version": (
+        overwrite("meta.json", b'{"format": 3}'),
+        r"meta\.json has format 3, this version reads 1 and 2",
+    ),
+    "nested without end": (overwrite("config.json", b"[" * 5000), "is not readable JSON"),
+}
+
+
 @pytest.mark.parametrize("name", DAMAGES)
 def test_broken_results_are_named(tmp_path: Path, name: str) -> None:
     damage, message = DAMAGES[name]
     folder = save(tmp_path / "run", made_results())
     damage(folder)
-    with pytest.raises(DataError, match=message):
+    with pytest.raises(DataError, match=message) as caught:
         load_results(folder)
+    assert "\n" not in str(caught.value)
+
+
+def test_tasks_of_results_are_checked_like_those_of_a_user(tmp_path: Path) -> None:
+    folder = save(tmp_path / "run", made_results())
+    rewrite("tasks.npz", goal=np.array([(1, 5), (99, 1)]))(folder)
+    with pytest.raises(DataError, match=r"tasks\.npz: task 1: goal \(99, 1\) is not a free cell"):
+        _ = load_results(folder).task_set
+
+
+def test_only_what_is_asked_for_is_read(tmp_path: Path) -> None:
+    """Damage in an array that nobody asks for is not seen."""
+    folder = save(tmp_path / "run", made_results())
+    rewrite("results.npz", actions=np.full((2, 2, 20, 6), "no"))(folder)
+    found = load_results(folder, PARTS - {"actions", "reached"})
+    assert (found.actions, found.reached) == (None, None)
+    assert found.choices.keys() == found.best.keys() == made_results().best.keys()
+    assert load_results(folder, ()).choices == {}
+    with pytest.raises(DataError, match="actions must hold numbers, found <U2"):
+        load_results(folder)
+
+
+def policy_in(folder: Path, seed: int) -> str:
+    """A policy for the world ``tiny``; returns the hash of its weights."""
+    config = network_config(ENV.spec, embed_dim=8, num_layers=1, max_prompt_length=3)
+    prompt = single_goal(jnp.zeros(ENV.spec.goal_dim), 3)
+    obs, actions = jnp.zeros((1, *ENV.spec.obs.shape)), jnp.zeros(1, jnp.int32)
+    params = GoalTransformer(config).init(jax.random.key(seed), prompt, obs, actions)
+    save_policy(folder, config, params, {})
+    return read_policy(folder).sha256
+
+
+def test_a_policy_is_found_where_it_was_moved_with_its_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Named relative to the working directory, then moved with the results, and read from elsewhere."""
+    (tmp_path / "old").mkdir()
+    monkeypatch.chdir(tmp_path / "old")
+    sha256 = policy_in(Path("policy"), 0)
+    results = made_results(config={"env": "tiny", "method": "ucb", "policy": "policy"})
+    save_results(Path("runs/one"), with_summary(results, sha256))
+    monkeypatch.chdir(tmp_path)
+    loaded = load_results(tmp_path / "old/runs/one")
+    assert load_policy_of(loaded, TINY).sha256 == sha256
+    (tmp_path / "old").rename(tmp_path / "new")
+    loaded = load_results(tmp_path / "new/runs/one")
+    assert load_policy_of(loaded, TINY).sha256 == sha256
+    # Another policy at the old place is not taken for it.
+    policy_in(tmp_path / "old/policy", 1)
+    assert load_policy_of(loaded, TINY).folder.resolve() == (tmp_path / "new/policy").resolve()
+    (tmp_path / "new/policy").rename(tmp_path / "mine")
+    with pytest.raises(
+        DataError, match=r"are not those .*; give the folder .*by --policy|--policy"
+    ):
+        load_policy_of(loaded, TINY)
+    assert load_policy_of(loaded, TINY, tmp_path / "mine").sha256 == sha256
+    with pytest.raises(DataError, match=r"old/policy .* are not those that .*--policy"):
+        load_policy_of(loaded, TINY, tmp_path / "old/policy")
+    (tmp_path / "old/policy").rename(tmp_path / "gone")
+    with pytest.raises(
+        DataError, match=r"the policy of .* tiny ucb is not in .*; give .* --policy"
+    ):
+        load_policy_of(loaded, TINY)
 
 
 FIRST_DAMAGES = {
     "lacks": (rewrite("results.npz", best_goals=None), r"lacks best\.prompt\.goals"),
     "axes": (
         rewrite("results.npz", best_masks=np.ones((2, 2, 20, 4), bool)),
-        r"best\.prompt\.mask has shape \[2, 2, 20, 4\], which does not fit the axes SNRP \(.*P 3",
+        r"best_masks has shape \[2, 2, 20, 4\], wanted \[seed 2, task 2, round 20, slot 3\]",
     ),
-    "no method": (overwrite("config.json", b'{"env": "tiny"}'), "does not name the method"),
+    "no method": (overwrite("config.json", b'{"env": "tiny"}'), "lacks method"),
 }
 
 
@@ -245,14 +382,30 @@ def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
         load_results(tmp_path / "nowhere")
 
 
-def test_unreadable_metrics_are_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ("", " has no rows"),
+        ("{", ", line 1 is not readable JSON"),
+        ("[]\n", ", line 1 does not hold a JSON object"),
+        ('{"loss": 1}\n', ", line 1: step must be an integer above 0, found none"),
+        ('{"step": "one"}\n', ", line 1: step must be a number, found 'one'"),
+        ('{"step": 1, "loss": NaN}\n', ", line 1: loss must be a finite number, found nan"),
+        ('{"step": 2}\n{"step": 2}\n', ", line 2: step must be an integer above 2, found 2"),
+        ('{"step": 2, "loss": 1}\n{"step": 4}\n', ", line 2 lacks loss"),
+        ('{"step": 2, "loss": 1}\n{"step": 4, "lo', ", line 2 is not readable JSON"),
+    ],
+)
+def test_unreadable_metrics_are_named(tmp_path: Path, content: str, says: str) -> None:
     path = tmp_path / "metrics.jsonl"
-    for content in ("{", "[]\n", '{"loss": 1}\n', '{"step": "one"}\n', "3\n"):
-        path.write_text(content)
-        with pytest.raises(DataError, match=r"metrics\.jsonl is missing or not readable"):
-            read_metrics(path)
-    path.unlink()
-    with pytest.raises(DataError, match=r"metrics\.jsonl is missing or not readable"):
+    path.write_text(content)
+    with pytest.raises(DataError, match=re.escape(f"{path}{says}; resume the run with")):
+        read_metrics(path, ["loss"])
+
+
+def test_metrics_come_back(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.jsonl"
+    with pytest.raises(DataError, match=r"metrics\.jsonl is missing; resume the run"):
         read_metrics(path)
     path.write_text('{"step": 10, "train/loss": 1.5}\n')
     assert read_metrics(path) == [{"step": 10, "train/loss": 1.5}]
@@ -269,7 +422,7 @@ def test_episodes_in_a_world_of_chance_can_be_played_again(tmp_path: Path) -> No
     policy = LoadedPolicy(config, params, {})
     outcome = adapt(env, policy, tasks, "gcbc", seeds=2, episodes=4, eval_every=4)
     made = {"env": "short", "method": "gcbc"}
-    save_results(tmp_path / "run", results_of(outcome, made, env, tasks, np.ones(3)))
+    save(tmp_path / "run", results_of(outcome, made, env, tasks, np.ones(3)))
     found = load_results(tmp_path / "run")
     again = jax.jit(lambda *args: replay(args[0], env, *args[1:]))
     starts = set()
@@ -286,8 +439,8 @@ def test_episodes_in_a_world_of_chance_can_be_played_again(tmp_path: Path) -> No
     assert len(starts) > 10
 
 
-def summary_of(results: Results) -> dict[str, Any]:
-    return summarize(results, policy_sha256="0", num_episodes=88, num_failed=0, cpu_seconds=2.0)
+def summary_of(results: Results, sha256: str = "0" * 64) -> dict[str, Any]:
+    return summarize(results, policy_sha256=sha256, num_episodes=88, num_failed=0, cpu_seconds=2.0)
 
 
 def test_summaries_are_of_the_results() -> None:
@@ -305,8 +458,6 @@ def test_summaries_are_of_the_results() -> None:
     assert "regret           0.850 ± 0.250" in text
     assert "solved optimally 25 %" in text
     assert "broke down" not in text
-    (row,) = comparison([summary]).splitlines()[2:]
-    assert "| 0.600 | 0.850 | 0.850 | 25 % |  |" in row
 
 
 def test_regret_after_40_is_unknown_where_nothing_was_judged_then() -> None:
@@ -328,11 +479,3 @@ def test_nothing_is_compared_with_an_unknown_optimum() -> None:
         "optimal_return", "regret", "regret_std_over_seeds", "regret_after_40", "solved_optimally",
     }  # fmt: skip
     assert not any(word in printed(summary) for word in ("optim", "regret", "nan"))
-    (row,) = comparison([summary]).splitlines()[2:]
-    assert row.endswith("|  |  |  |  |  |")
-
-
-def test_the_table_stands_beside_the_papers_numbers() -> None:
-    summaries = [{**summary_of(made_results(name)), "env": "maze15"} for name in ("ucb", "gcbc")]
-    rows = comparison(summaries).splitlines()[2:]
-    assert [row.split("|")[-2].strip() for row in rows] == ["-0.41 ± 0.10", "-2.63"]

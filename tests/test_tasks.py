@@ -14,8 +14,8 @@ from envs.errors import DataError, UsageError
 from envs.wrappers import Wrapper
 from experiments.datasets import find_demonstrator
 from experiments.training import GreedyEvaluation
-from mgpo_jax.policy_files import released_folder
 from mgpo_jax.prompts import single_goal
+from mgpo_jax.released import released_folder
 from mgpo_jax.tasks import (
     benchmark_tasks,
     evaluation_tasks,
@@ -104,11 +104,43 @@ def test_files_that_hold_no_tasks(tmp_path):
     with pytest.raises(DataError, match="lacks goal; tasks of maze15 need the arrays maze, goal"):
         load_tasks(path, env)
     np.savez(path, maze=tasks.maze[:0], goal=tasks.goal[:0])
-    with pytest.raises(DataError, match="holds no tasks"):
+    with pytest.raises(DataError, match=r"maze has shape \[0, 15, 15\], wanted \[task 1 to"):
         load_tasks(path, env)
     np.savez(path, maze=tasks.maze, goal=tasks.goal * 0)
     with pytest.raises(DataError, match=r"tasks\.npz: task 0: goal \(0, 0\) is not a free cell"):
         load_tasks(path, env)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda t: {"maze": t.maze.astype(complex)}, "maze must hold integers, found complex128"),
+        (lambda t: {"goal": t.goal.astype("m8[s]")}, "goal must hold integers, found timedelta64"),
+        (lambda t: {"maze": t.maze.astype(str)}, "maze must hold integers, found <U"),
+        (
+            lambda t: {"goal": t.goal.astype(np.int64) + 2**40},
+            r"goal holds .* at task 0, must be from -2147483648",
+        ),
+        (lambda t: {"maze": np.array([None] * 2)}, "maze must hold integers, found object"),
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_arrays_that_are_no_numbers_of_tasks(tmp_path, change, says):
+    """Nothing is converted with a warning, and no pickle is opened."""
+    env, path = envs.make("maze15"), tmp_path / "tasks.npz"
+    tasks = jax.tree.map(np.asarray, sample_tasks(env, 3, 2))
+    np.savez(path, **{**tasks._asdict(), **change(tasks)})
+    with pytest.raises(DataError, match=f"{says}.*tasks of maze15 need the arrays maze, goal"):
+        load_tasks(path, env)
+
+
+@pytest.mark.parametrize("dtype", [">i8", np.uint8, np.uint64])
+def test_tasks_of_foreign_tools_are_converted(tmp_path, dtype):
+    env, path = envs.make("maze15"), tmp_path / "tasks.npz"
+    tasks = jax.tree.map(np.asarray, sample_tasks(env, 3, 2))
+    np.savez(path, **{k: np.asfortranarray(v.astype(dtype)) for k, v in tasks._asdict().items()})
+    assert_trees_equal(load_tasks(path, env), tasks)
+    assert load_tasks(path, env).maze.dtype == np.int32
 
 
 @pytest.mark.parametrize(("name", "demonstrates"), [("gridworld", True), ("maze15", False)])

@@ -5,18 +5,22 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
 import envs
+from envs.errors import DataError, UsageError, printable, shown
+from envs.registry import WORLDS, World
 from experiments.datasets import find_demonstrator
 from experiments.figures import training_curve
-from experiments.store.metrics import METRICS, read_metrics
-from experiments.store.settings import saved_pretraining
-from mgpo_jax.files import read_object
-from mgpo_jax.policy import LoadedPolicy
-from mgpo_jax.policy_files import CONFIG, WEIGHTS, read_policy, released_folder
+from experiments.store.metrics import METRICS, RESUME, read_metrics
+from experiments.store.provenance import read_meta
+from experiments.store.settings import PretrainConfig, pretraining_from
+from mgpo_jax.files import new_folder, write_text
+from mgpo_jax.policy import LoadedPolicy, check_fits
+from mgpo_jax.policy_files import CONFIG, WEIGHTS, read_policy
+from mgpo_jax.released import released_folder
 from mgpo_jax.tasks import benchmark_tasks, save_tasks
 from mgpo_jax.training import HIT
 
@@ -44,9 +48,56 @@ test tasks, in no dataset), `metrics.jsonl`. Results on them are in `results/` a
 """
 
 
-def world_of(policy: Path) -> Path:
-    """Where the policy of a run is released: the folder of its world."""
-    return released_folder(envs.find(read_policy(policy).made["env"]))
+METRICS_SHOWN = (
+    "train/loss", "val/loss", "val/accuracy", "eval/initial_return", "cpu_seconds_per_step"
+)  # fmt: skip
+
+
+class Finished(NamedTuple):
+    """A pre-training run that can be released."""
+
+    source: Path
+    world: World
+    policy: LoadedPolicy
+    settings: PretrainConfig
+    rows: list[dict[str, Any]]
+    """Its metrics."""
+    command: str
+
+    @property
+    def released(self) -> Path:
+        """Where the world's released policy lies."""
+        return released_folder(self.world)
+
+
+def read_run(source: Path, env: str | None = None) -> Finished:
+    """Read a finished run.
+
+    Args:
+      source: its folder.
+      env: the name or place of its world, as a user gives it.
+
+    Raises:
+      DataError: if a file is missing or damaged, or the policy does not fit the world that it names.
+      UsageError: if the run has no policy, or is of another world than ``env``.
+    """
+    policy, path = read_policy(source / "policy"), source / "policy" / CONFIG
+    given = envs.find(env) if env is not None else None  # from now on files may name its place
+    name, settings = policy.made.get("env"), policy.made.get("config")
+    if name is None or not isinstance(settings, dict):
+        raise DataError(f"{path} lacks made.env or made.config; {RESUME}")
+    world = WORLDS.known(name, path, "--env")
+    if given is not None and given is not world:
+        raise UsageError(f"--env {env}, but the policy in {source} was made for {name}")
+    check_fits(policy.config, world.make().spec, f"the policy in {source}")
+    config = pretraining_from(settings, path)
+    if config.env != name:
+        raise DataError(
+            f"{path}: made.env is {shown(name)}, made.config.env is {shown(config.env)}; {RESUME}"
+        )
+    rows = read_metrics(source / METRICS, METRICS_SHOWN)
+    meta = read_meta(source / "meta.json", RESUME)
+    return Finished(source, world, policy, config, rows, " ".join(meta.command) or "(not known)")
 
 
 def cpu_minutes(rows: Sequence[dict[str, Any]]) -> float:
@@ -57,47 +108,42 @@ def cpu_minutes(rows: Sequence[dict[str, Any]]) -> float:
     return sum(seconds) / 60
 
 
-def card(source: Path, policy: LoadedPolicy, rows: Sequence[dict[str, Any]]) -> str:
+def card(run: Finished) -> str:
     """The text that describes a released policy."""
-    network, made, last = policy.config, policy.made, rows[-1]
-    settings = saved_pretraining(made["config"], source)
-    world, env = envs.find(made["env"]), envs.make(made["env"])
+    network, settings, last, env = run.policy.config, run.settings, run.rows[-1], run.world.make()
     order = "with" if network.prompt_order else "without"
     return CARD.format(
-        env=made["env"],
+        env=settings.env,
         num_layers=network.num_layers,
         embed_dim=network.embed_dim,
         num_heads=network.num_heads,
-        num_weights=sum(leaf.size for leaf in jax.tree.leaves(policy.params)),
+        num_weights=sum(leaf.size for leaf in jax.tree.leaves(run.policy.params)),
         max_prompt_length=network.max_prompt_length,
         order=f"{order} an order embedding",
-        trajectories=settings["data"]["trajectories"],
-        demonstrator=find_demonstrator(world, env, settings["data"]["demonstrator"])[0],
-        data_seed=settings["data"]["data_seed"],
-        steps=made["steps"],
-        batch_size=settings["train"]["batch_size"],
-        optimizer=settings["train"]["optimizer"],
-        cpu_minutes=cpu_minutes(rows),
+        trajectories=settings.data.trajectories,
+        demonstrator=find_demonstrator(run.world, env, settings.data.demonstrator)[0],
+        data_seed=settings.data.data_seed,
+        steps=last["step"],
+        batch_size=settings.train.batch_size,
+        optimizer=settings.train.optimizer,
+        cpu_minutes=cpu_minutes(run.rows),
         val_loss=last["val/loss"],
         val_accuracy=last["val/accuracy"],
         initial=last["eval/initial_return"],
         followed=f"{last[FOLLOWED]:.3f} on the same tasks" if FOLLOWED in last else "-",
         correct="accuracy" if env.spec.discrete else f"share within {HIT} in all dimensions",
-        eval_tasks=settings["eval_tasks"],
-        command=" ".join(read_object(source / "meta.json")["command"]),
+        eval_tasks=settings.eval_tasks,
+        command=printable(run.command),
     )
 
 
-def release(source: Path, folder: Path) -> None:
-    """Write the released form of a finished pre-training run to a new folder."""
-    policy = read_policy(source / "policy")
-    rows = read_metrics(source / METRICS)
-    text = card(source, policy, rows)
-    world, env = envs.find(policy.made["env"]), envs.make(policy.made["env"])
-    folder.mkdir(parents=True)
-    for name in (WEIGHTS, CONFIG):
-        shutil.copy(source / "policy" / name, folder / name)
-    shutil.copy(source / METRICS, folder)
-    training_curve(rows).savefig(folder / "training.png")
-    save_tasks(folder / "tasks.npz", benchmark_tasks(env, world.num_test_tasks))
-    (folder / "README.md").write_text(text)
+def release(run: Finished, folder: Path) -> None:
+    """Write the released form of a run to a new folder, which appears when all of it is there."""
+    tasks = benchmark_tasks(run.world.make(), run.world.num_test_tasks)
+    with new_folder(folder) as place:
+        for name in (WEIGHTS, CONFIG):
+            shutil.copy(run.source / "policy" / name, place / name)
+        shutil.copy(run.source / METRICS, place)
+        training_curve(run.rows).savefig(place / "training.png")
+        save_tasks(place / "tasks.npz", tasks)
+        write_text(place / "README.md", card(run))

@@ -5,23 +5,50 @@ from __future__ import annotations
 from pathlib import Path
 
 from envs.errors import DataError
-from envs.registry import World, find
+from envs.registry import World
+from experiments.store.layout import META
+from experiments.store.provenance import read_meta
 from experiments.store.results import Results
+from experiments.store.summary import ADAPT_AGAIN
 from mgpo_jax.policy import LoadedPolicy
-from mgpo_jax.policy_files import load_policy, released_folder
+from mgpo_jax.policy_files import CONFIG, load_policy
+from mgpo_jax.released import released_folder
+
+GIVE = "give the folder of the one that they were made with by --policy"
 
 
-def load_policy_of(results: Results, world: World) -> LoadedPolicy:
+def load_policy_of(results: Results, world: World, override: Path | None = None) -> LoadedPolicy:
     """The policy that an adaptation was made with, checked against a world to act in.
 
+    Args:
+      results: the adaptation.
+      world: where the policy is to act.
+      override: folder of the policy (default: the first of the places where it may lie by now).
+
     Raises:
-      DataError: if there are other weights at its place by now, or it does not fit the world.
+      DataError: if it is at none of its places, there are other weights by now, or it does not fit.
     """
-    path = results.config.get("policy")
-    folder = Path(path) if path else released_folder(find(results.env))
-    policy = load_policy(world, folder)
-    check_weights(results, policy, "adapt again with `python -m experiments.adapt`")
+    places = [override] if override is not None else places_of_policy(results)
+    there = [place for place in places if (place / CONFIG).is_file()] or places[:1]
+    if override is None and not (there[0] / CONFIG).is_file():
+        listed = ", ".join(str(place) for place in places)
+        raise DataError(f"the policy of {_told(results)} is not in {listed}; {GIVE}")
+    for place in there:
+        policy = load_policy(world, place)
+        if policy.sha256 == results.summary.get("policy_sha256", policy.sha256):
+            return policy
+    check_weights(results, policy, f"{GIVE}, or {ADAPT_AGAIN}")
     return policy
+
+
+def places_of_policy(results: Results) -> list[Path]:
+    """Where the policy of an adaptation may lie: beside results that were moved with it, where it was when
+    they were made, or where that is from here."""
+    policy, folder = results.config.get("policy"), results.folder
+    if not policy:
+        return [released_folder(results.world)]
+    noted = [] if folder is None else read_meta(folder / META, ADAPT_AGAIN).policy_places
+    return list(dict.fromkeys([*(Path(folder or "", place) for place in noted), Path(policy)]))
 
 
 def check_weights(results: Results, policy: LoadedPolicy, mend: str) -> None:
@@ -29,6 +56,10 @@ def check_weights(results: Results, policy: LoadedPolicy, mend: str) -> None:
     made_with = results.summary.get("policy_sha256", policy.sha256)
     if policy.sha256 != made_with:
         raise DataError(
-            f"the weights in {policy.folder} ({policy.sha256[:12]}) are not those that the results of "
-            f"{results.env} {results.method} were found with ({made_with[:12]}): " + mend
+            f"the weights in {policy.folder} ({policy.sha256[:12]}) are not those that {_told(results)} "
+            f"were found with ({made_with[:12]}): {mend}"
         )
+
+
+def _told(results: Results) -> str:
+    return f"the results of {results.env} {results.method}"

@@ -8,12 +8,44 @@ import subprocess
 import sys
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from annotated_types import MaxLen
+from pydantic import BaseModel, StringConstraints
+
+from mgpo_jax.schema import STRICT, read_document
 
 PACKAGES = (
     "mgpo-jax", "jax", "jaxlib", "flax", "optax", "evosax", "numpy", "mujoco", "mujoco-mjx",
     "gymnasium-robotics",
 )  # fmt: skip
+
+
+Place = Annotated[str, StringConstraints(min_length=1, max_length=4096)]
+"""A path in a file."""
+
+
+class Meta(BaseModel):
+    """What is read of a ``meta.json``; there may be other entries."""
+
+    model_config = {**STRICT, "extra": "ignore"}
+
+    format: int = 1
+    command: list[str] = []
+    revision: str = ""
+    versions: dict[str, str] = {}
+    devices: list[str] = []
+    policy_places: Annotated[list[Place], MaxLen(8)] = []
+    """Where the policy of an adaptation lies: relative to its folder, and absolute."""
+
+
+def read_meta(path: Path, mend: str) -> Meta:
+    """How and with what something was made. What was made by the first version may have no such file.
+
+    Raises:
+      DataError: if the file is damaged.
+    """
+    return read_document(path, Meta, mend) if path.exists() else Meta()
 
 
 def versions() -> dict[str, str]:

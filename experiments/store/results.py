@@ -12,7 +12,8 @@ The folder of an adaptation holds
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -21,21 +22,34 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from pydantic import BaseModel
 
-import envs
 from envs.base import Environment, Episode, Task
 from envs.episodes import replay
-from envs.errors import DataError
-from experiments.store.provenance import provenance
-from mgpo_jax.files import load_arrays, new_folder, read_object, write_json
+from envs.errors import DataError, shown
+from envs.registry import WORLDS, World
+from experiments.store.layout import ARRAYS, CONFIG, META, SUMMARY, TASKS
+from experiments.store.provenance import Place, provenance, read_meta
+from experiments.store.summary import ADAPT_AGAIN, read_summary
+from mgpo_jax.files import new_folder, write_arrays, write_json
+from mgpo_jax.methods import METHODS
 from mgpo_jax.runner import Outcome, Reached
+from mgpo_jax.schema import (
+    STRICT,
+    ArrayField,
+    Json,
+    Name,
+    Sizes,
+    array_names,
+    checked_entry,
+    read_arrays,
+    read_document,
+)
+from mgpo_jax.settings import Count, NumEpisodes, NumSeeds, Seed
 from mgpo_jax.tasks import save_tasks, task_arrays, task_at, tasks_from
 from mgpo_jax.trees import named_leaves
 
 FORMAT = 2  # 1 had only prompts as choices, and neither actions nor reached goals
-ARRAYS, TASKS, CONFIG, META, SUMMARY = (
-    "results.npz", "tasks.npz", "config.json", "meta.json", "summary.json"
-)  # fmt: skip
 # Names of format 1 and what they are called now.
 OLD_NAMES = {
     "greedy": "choice.greedy",
@@ -44,27 +58,45 @@ OLD_NAMES = {
     "best_goals": "best.prompt.goals",
     "best_masks": "best.prompt.mask",
 }
-# Axes: S seeds, N tasks, E episodes, R rounds, P slots of a prompt, T steps, G goal size, C judgements,
-# L reached goals, U different ones.
 AXES = {
-    "returns": "SNE",
-    "eval_episodes": "C",
-    "eval_returns": "SNC",
-    "optimal_returns": "N",
-    "task_goals": "NG",
-    "lengths": "SNE",
-    "keys": "SNE2",
-    "actions": "SNET*",
-    "reached_counts": "SNE",
-    "reached_steps": "L",
-    "reached_index": "L",
-    "reached_table": "UG",
-    "choice.prompt.goals": "SNRPG",
-    "choice.prompt.mask": "SNRP",
-    "best.prompt.goals": "SNRPG",
-    "best.prompt.mask": "SNRP",
+    "S": "seed", "N": "task", "E": "episode", "R": "round", "P": "slot", "T": "step", "G": "number",
+    "C": "judgement", "L": "reached goal", "U": "different goal",
+}  # fmt: skip
+"""Axes of the arrays by a letter, with their names in messages."""
+SIZES: Sizes = dict.fromkeys(("seed", "task", "episode", "round", "judgement"), range(1, 2**31))
+FAR = 1e9  # no coordinate of a goal is farther from 0
+
+
+def _field(axes: str, dtype: str, **more: Any) -> ArrayField:
+    """What an array must look like, with its axes as letters."""
+    shape = [... if axis == "*" else AXES.get(axis) or int(axis) for axis in axes]
+    return ArrayField(tuple(shape), dtype, **more)
+
+
+_GOALS = {"low": -FAR, "high": FAR}
+FIELDS = {
+    "returns": _field("SNE", "float32"),
+    "eval_episodes": _field("C", "int64", low=1),
+    "eval_returns": _field("SNC", "float32"),
+    "optimal_returns": _field("N", "float32", required=False),
+    "task_goals": _field("NG", "float32", required=False, **_GOALS),
+    "lengths": _field("SNE", "integers", required=False, low=0),
+    "keys": _field("SNE2", "uint32", required=False),
+    "actions": _field("SNET*", "numbers", required=False),
+    "reached_counts": _field("SNE", "int32", required=False, low=0),
+    "reached_steps": _field("L", "integers", required=False, low=0),
+    "reached_index": _field("L", "integers", required=False, low=0),
+    "reached_table": _field("UG", "float32", required=False, **_GOALS),
 }
-REQUIRED = ("returns", "eval_episodes", "eval_returns")
+PART_FIELDS = {
+    "prompt.goals": _field("SNRPG", "float32", **_GOALS),
+    "prompt.mask": _field("SNRP", "bool"),
+}
+"""Of the parts of choices that are known; any other is ``OTHER_PART``."""
+OTHER_PART = _field("SNR*", "anything")
+REACHED = ("reached_counts", "reached_steps", "reached_index", "reached_table")
+PARTS = frozenset({"choices", "lengths", "keys", "actions", "reached"})
+"""What ``load_results`` can leave out."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +130,8 @@ class Results:
     """The goals that the episodes reached, with their steps."""
     summary: dict[str, Any] = field(default_factory=dict)
     """The numbers that tables show."""
+    folder: Path | None = None
+    """Where they were read; None for those of this process."""
 
     @property
     def env(self) -> str:
@@ -114,14 +148,22 @@ class Results:
         return bool(np.isfinite(self.optimal_returns).all())
 
     @cached_property
+    def world(self) -> World:
+        """The record of the world; a place in a file is not imported."""
+        where = "the results" if self.folder is None else self.folder / CONFIG
+        return WORLDS.known(self.env, where, "--env")
+
+    @cached_property
     def task_set(self) -> Task:
         """The tasks as the world's record."""
-        return tasks_from(self.tasks, envs.make(self.env), "the tasks of the results", trusted=True)
+        where = "the tasks of the results" if self.folder is None else self.folder / TASKS
+        trusted = self.folder is None  # they were checked when they were drawn or read
+        return tasks_from(self.tasks, self.world.make(), where, trusted)
 
     @cached_property
     def task_goals(self) -> np.ndarray:
         """[N, G] task goals g^M."""
-        return np.asarray(jax.vmap(envs.make(self.env).task_goal)(self.task_set))
+        return np.asarray(jax.vmap(self.world.make().task_goal)(self.task_set))
 
     def task(self, index: int) -> Task:
         """One task, with numpy leaves."""
@@ -165,7 +207,7 @@ class Results:
                 "these results hold no actions; adapt again, with --keep-actions where they are continuous"
             )
         where = (seed, task, episode)
-        env, actions = envs.make(self.env), self.actions[where]
+        env, actions = self.world.make(), self.actions[where]
         if self.lengths is not None:
             length = int(self.lengths[where])
         else:  # the largest number of the type stands after the end
@@ -212,6 +254,12 @@ def _parts(choice: Any) -> dict[str, np.ndarray]:
 
 def save_results(folder: Path, results: Results) -> None:
     """Write results to a new folder, which appears when all of it is there."""
+    with new_folder(folder) as place:
+        write_results(place, results, folder)
+
+
+def write_results(place: Path, results: Results, folder: Path) -> None:
+    """Write the files of results into a place that becomes ``folder``."""
     arrays = {
         "returns": results.returns,
         "eval_episodes": results.eval_episodes,
@@ -230,12 +278,20 @@ def save_results(folder: Path, results: Results) -> None:
         arrays["actions"] = results.actions
     if results.reached is not None:
         arrays |= _compact(results.reached)
-    with new_folder(folder) as partial:
-        np.savez_compressed(partial / ARRAYS, allow_pickle=False, **arrays)
-        save_tasks(partial / TASKS, results.task_set)
-        write_json(partial / CONFIG, results.config)
-        write_json(partial / META, {"format": FORMAT, **provenance()})
-        write_json(partial / SUMMARY, results.summary)
+    write_arrays(place / ARRAYS, arrays)
+    save_tasks(place / TASKS, results.task_set)
+    write_json(place / CONFIG, results.config)
+    places = policy_places(folder, results.config.get("policy"))
+    write_json(place / META, {"format": FORMAT, **provenance(), "policy_places": places})
+    write_json(place / SUMMARY, results.summary)
+
+
+def policy_places(folder: Path, policy: str | None) -> list[str]:
+    """Where a policy lies: relative to the results, so that both can be moved together, and absolute."""
+    if policy is None:
+        return []
+    absolute = os.path.abspath(policy)
+    return [os.path.relpath(absolute, os.path.abspath(folder)), absolute]
 
 
 def _compact(reached: Reached) -> dict[str, np.ndarray]:
@@ -249,94 +305,168 @@ def _compact(reached: Reached) -> dict[str, np.ndarray]:
     }
 
 
-def load_results(folder: Path) -> Results:
+class Config(BaseModel):
+    """What is known of the settings in ``config.json``; there may be others."""
+
+    model_config = {**STRICT, "extra": "ignore"}
+
+    env: Name
+    method: Name | None = None
+    bandit: Name | None = None
+    """The method, as older versions call it."""
+    policy: Place | None = None
+    tasks: Place | None = None
+    validation: bool = False
+    seeds: NumSeeds | None = None
+    episodes: NumEpisodes | None = None
+    seed: Seed = 0
+    eval_every: Count | None = None
+    eval_episodes: Count | None = None
+    max_goals: Count | None = None
+    keep_rewarded: bool = True
+    keep_actions: bool = False
+    hyper: dict[str, Json] = {}
+    options: dict[str, Json] = {}
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """The settings of results.
+
+    Raises:
+      DataError: if ``config.json`` is missing or damaged, or names a world or method that is not known.
+    """
+    path = folder / CONFIG
+    document = read_document(path, dict[str, Json], ADAPT_AGAIN)
+    config: Config = checked_entry(document, Config, path, "", ADAPT_AGAIN)
+    method = config.method or config.bandit
+    if method is None:
+        raise DataError(f"{path} lacks method; {ADAPT_AGAIN}")
+    WORLDS.known(config.env, path, "--env")
+    if ":" not in method:  # a place is only shown: nothing is imported for it
+        METHODS.known(method, path)
+    return document
+
+
+def _check_format(path: Path) -> None:
+    """Raise ``DataError`` for results of a later version."""
+    found = read_meta(path, ADAPT_AGAIN).format
+    if found not in (1, FORMAT):
+        raise DataError(
+            f"{path} has format {found}, this version reads 1 and {FORMAT}; {ADAPT_AGAIN}"
+        )
+
+
+def load_results(folder: Path, parts: Collection[str] = PARTS) -> Results:
     """Read the folder of one adaptation.
+
+    Args:
+      folder: where ``save_results`` wrote it.
+      parts: those of ``PARTS`` that are wanted; nothing else of them is read.
 
     Raises:
       DataError: if a file is missing, unreadable or does not fit the others.
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise DataError(f"no result folder {folder}")
+        raise DataError(f"no result folder {folder}; make one with `python -m experiments.adapt`")
     for name in (ARRAYS, TASKS, CONFIG, SUMMARY):
         if not (folder / name).is_file():
-            raise DataError(f"{folder / name} is missing; is {folder} the folder of an adaptation?")
-    config = read_object(folder / CONFIG)
-    if not isinstance(config.get("env"), str):
-        raise DataError(f"{folder / CONFIG} does not name the env")
-    if not isinstance(config.get("method", config.get("bandit")), str):
-        raise DataError(f"{folder / CONFIG} does not name the method")
-    where = folder / ARRAYS
-    arrays = {OLD_NAMES.get(name, name): array for name, array in load_arrays(where).items()}
-    tasks = load_arrays(folder / TASKS)
-    sizes = _check_arrays(arrays, where)
-    for name, array in tasks.items():
-        if array.ndim == 0 or len(array) != sizes["N"]:
             raise DataError(
-                f"{folder / TASKS}: {name} has shape {list(array.shape)}, "
-                f"the results are of {sizes['N']} tasks"
+                f"{folder / name} is missing; is {folder} the folder of an adaptation? If so, {ADAPT_AGAIN}"
             )
+    config = read_config(folder)
+    _check_format(folder / META)
+    arrays = _read_parts(folder / ARRAYS, config, parts)
+    num_tasks = arrays["returns"].shape[1]
+    optimum = arrays.get("optimal_returns")
     results = Results(
         config=config,
-        tasks=tasks,
+        tasks=_read_tasks(folder / TASKS, num_tasks),
         returns=arrays["returns"],
         choices=_with_prefix(arrays, "choice."),
         best=_with_prefix(arrays, "best."),
         eval_episodes=arrays["eval_episodes"],
         eval_returns=arrays["eval_returns"],
-        optimal_returns=arrays.get("optimal_returns", np.full(sizes["N"], np.nan)),
+        optimal_returns=np.full(num_tasks, np.nan) if optimum is None else optimum,
         lengths=arrays.get("lengths"),
         keys=arrays.get("keys"),
         actions=arrays.get("actions"),
-        reached=_expand(arrays, where),
-        summary=read_object(folder / SUMMARY),
+        reached=_expand(arrays, folder / ARRAYS),
+        summary=dict(read_summary(folder)),
+        folder=folder,
     )
     if "task_goals" in arrays:
         vars(results)["task_goals"] = arrays["task_goals"]  # saves making the world
     return results
 
 
-def read_summary(folder: Path) -> dict[str, Any]:
-    """The numbers that tables show, of a result folder."""
-    return read_object(Path(folder) / SUMMARY)
+def _read_tasks(path: Path, num: int) -> dict[str, np.ndarray]:
+    """The arrays of the tasks; what they must look like is known when their world is."""
+    fields = {name: _field("N*", "anything") for name in array_names(path, ADAPT_AGAIN)}
+    return read_arrays(path, fields, {"task": num}, ADAPT_AGAIN)
 
 
-def _check_arrays(arrays: Mapping[str, np.ndarray], where: Path) -> dict[str, int]:
-    """Raise ``DataError`` if arrays are missing or do not fit together; returns the sizes of the axes."""
-    if missing := [name for name in (*REQUIRED, *_expected_parts(arrays)) if name not in arrays]:
-        raise DataError(f"{where} lacks {', '.join(missing)}")
-    parts = [name for name in arrays if name.startswith(("choice.", "best."))]
-    axes_of = dict.fromkeys(parts, "SNR*")
-    axes_of |= {name: axes for name, axes in AXES.items() if name in arrays}
-    sizes: dict[str, int] = {}
-    for name, axes in axes_of.items():
-        shape, wanted = arrays[name].shape, axes.removesuffix("*")
-        fits = len(shape) >= len(wanted) if axes.endswith("*") else len(shape) == len(wanted)
-        fits = fits and all(
-            size == int(axis) if axis.isdigit() else sizes.setdefault(axis, size) == size
-            for axis, size in zip(wanted, shape, strict=False)
-        )
-        if not fits or (name in REQUIRED and 0 in shape):
-            raise DataError(
-                f"{where}: {name} has shape {list(shape)}, which does not fit the axes {axes} "
-                f"({', '.join(f'{axis} {size}' for axis, size in sizes.items())})"
-            )
-    for name in ("returns", "eval_returns", "optimal_returns"):
-        if name in arrays and not np.isfinite(arrays[name]).all():
-            raise DataError(f"{where}: {name} holds NaN or infinity")
-    return sizes
+def _read_parts(
+    path: Path, config: Mapping[str, Any], parts: Collection[str]
+) -> dict[str, np.ndarray]:
+    """The arrays of results that are wanted, by their present names."""
+    stored = {OLD_NAMES.get(name, name): name for name in array_names(path, ADAPT_AGAIN)}
+    fields = {name: field for name, field in FIELDS.items() if _wanted(name, parts)}
+    for name in _parts_of_choices(stored):
+        prefix, _, part = name.partition(".")
+        if prefix == "best" or "choices" in parts:
+            fields[name] = PART_FIELDS.get(part, OTHER_PART)
+    sizes = {"seed": config.get("seeds"), "episode": config.get("episodes")}
+    known = {axis: size for axis, size in sizes.items() if size is not None}
+    in_file = {stored.get(name, name): field for name, field in fields.items()}
+    found = read_arrays(path, in_file, {**SIZES, **known}, ADAPT_AGAIN)
+    arrays = {OLD_NAMES.get(name, name): array for name, array in found.items()}
+    _check_values(arrays, path)
+    return arrays
 
 
-def _expected_parts(arrays: Mapping[str, np.ndarray]) -> list[str]:
+def _wanted(name: str, parts: Collection[str]) -> bool:
+    part = "reached" if name in REACHED else name
+    return part in parts or part not in PARTS
+
+
+def _parts_of_choices(stored: Mapping[str, str]) -> list[str]:
     """Names of the parts of choices: who acted and the best choice have the same ones."""
-    parts = {*_with_prefix(arrays, "choice."), *_with_prefix(arrays, "best.")}
-    if not parts and "task_goals" not in arrays:  # format 1, in which every choice is a prompt
-        parts = {"*"}
-    expected = [f"{prefix}{part}" for prefix in ("choice.", "best.") for part in sorted(parts)]
-    return [name for name in expected if name != "best.greedy"]  # which format 1 did not keep
+    parts = {*_with_prefix(stored, "choice."), *_with_prefix(stored, "best.")}
+    if "task_goals" not in stored:  # the first version, in which every choice is a prompt
+        parts |= PART_FIELDS.keys()
+    # The first version did not keep whether the best prompt is acted on greedily.
+    return [
+        f"{prefix}{part}"
+        for prefix in ("choice.", "best.")
+        for part in sorted(parts)
+        if f"{prefix}{part}" != "best.greedy" or "best.greedy" in stored
+    ]
 
 
-def _with_prefix(arrays: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+def _check_values(arrays: Mapping[str, np.ndarray], path: Path) -> None:
+    """Raise ``DataError`` for numbers that contradict each other."""
+    judged, num = arrays["eval_episodes"], arrays["returns"].shape[2]
+    if (np.diff(judged) <= 0).any() or judged[-1] > num:
+        raise DataError(
+            f"{path}: eval_episodes must ascend from 1 to at most {num}, found "
+            f"{shown(judged.tolist())}; {ADAPT_AGAIN}"
+        )
+    for name in ("choice.prompt.mask", "best.prompt.mask"):
+        if name in arrays and not (some := arrays[name].any(axis=-1)).all():
+            seed, task, round_ = (int(axis) for axis in np.argwhere(~some)[0])
+            raise DataError(
+                f"{path}: {name} leaves no goal at seed {seed}, task {task}, round {round_}; {ADAPT_AGAIN}"
+            )
+    lengths, actions = arrays.get("lengths"), arrays.get("actions")
+    if lengths is not None and actions is not None and lengths.max() > actions.shape[3]:
+        raise DataError(
+            f"{path}: lengths holds {lengths.max()}, there are actions of {actions.shape[3]} steps; "
+            + ADAPT_AGAIN
+        )
+
+
+def _with_prefix(arrays: Mapping[str, Any], prefix: str) -> dict[str, Any]:
     return {
         name.removeprefix(prefix): array
         for name, array in arrays.items()
@@ -346,13 +476,18 @@ def _with_prefix(arrays: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.
 
 def _expand(arrays: Mapping[str, np.ndarray], where: Path) -> Reached | None:
     """Reached goals from their places in the table of different goals."""
-    if "reached_counts" not in arrays:
+    found = [arrays[name] for name in REACHED if name in arrays]
+    if not found:
         return None
-    try:
-        counts, steps = arrays["reached_counts"].astype(np.int32), arrays["reached_steps"]
-        goals = arrays["reached_table"][arrays["reached_index"]]
-    except (KeyError, IndexError):
-        raise DataError(f"{where}: the reached goals are incomplete") from None
-    if counts.sum() != len(steps):
-        raise DataError(f"{where}: {counts.sum()} goals were reached, in {len(steps)} steps")
-    return Reached(counts, steps, goals)
+    if len(found) < len(REACHED):
+        raise DataError(f"{where}: the reached goals are incomplete; {ADAPT_AGAIN}")
+    counts, steps, index, table = found
+    if index.max(initial=0) >= max(len(table), 1):
+        raise DataError(
+            f"{where}: reached_index holds {index.max()}, reached_table has {len(table)} goals; "
+            + ADAPT_AGAIN
+        )
+    num = int(counts.sum(dtype=np.int64))
+    if num != len(steps):
+        raise DataError(f"{where}: {num} goals were reached, in {len(steps)} steps; {ADAPT_AGAIN}")
+    return Reached(counts, steps, table[index])
