@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+import shutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -10,25 +13,36 @@ from typing import Any, NamedTuple
 
 import envs
 from envs.errors import UsageError, nearest
-from experiments.adaptation import adapt_all, save_outcome
-from experiments.figures import learning_curve
+from experiments.adaptation import adapt_all, deciding, save_outcome
+from experiments.drawing import write
+from experiments.figures import later, learning_curve
+from experiments.signals import farewell
+from experiments.store import runs
 from experiments.store.paper import paper_value
 from experiments.store.policies import check_weights
-from experiments.store.results import load_results, read_summary
+from experiments.store.results import load_results
+from experiments.store.seals import write_sealed
 from experiments.store.settings import (
     AdaptConfig,
     DataConfig,
     ReproduceConfig,
     pretrain_preset,
 )
+from experiments.store.statistics import SeedSpread
+from experiments.store.summary import read_summary
 from experiments.store.tables import number, table
 from experiments.training import train
+from mgpo_jax.claims import claimed
 from mgpo_jax.distributions import HEADS
+from mgpo_jax.files import to_json
+from mgpo_jax.journal import Journal
 from mgpo_jax.methods import UcbHyper
 from mgpo_jax.policy_files import load_policy
 from mgpo_jax.tasks import test_tasks
 
 EPISODES = 100  # of an adaptation
+GO_ON = "run the same command again to go on"
+UNFINISHED = "unfinished-"  # how folders begin that hold the finished pieces of an adaptation
 LONGEST = 5  # goals of a prompt where the paper varies c
 
 
@@ -60,10 +74,10 @@ def trained(
     )
     size = f"{config.num_steps}steps-{config.num_trajectories}episodes"
     folder = config.folder / "policies" / f"{label}-k{settings.max_prompt_length}-{size}"
-    if not (folder / "policy").is_dir():
+    if not runs.is_finished(folder):
         print(f"training {folder}", file=sys.stderr)
-        train(replace(settings, out=folder, resume=folder.exists()))
-    return folder / "policy"
+        train(replace(settings, out=folder, resume=runs.has_begun(folder)), GO_ON)
+    return folder / runs.POLICY
 
 
 def adapted(
@@ -96,9 +110,14 @@ def adapted(
         )
         for folder, hyper in missing.items()
     ]
-    outcomes = adapt_all(world, env, policy, tasks, configs)
-    for settings, outcome in zip(configs, outcomes, strict=True):
-        save_outcome(settings.folder, settings, env, policy, tasks, outcome)
+    same = [[deciding(to_json(settings)) for settings in configs], policy.sha256]
+    mark = hashlib.sha256(json.dumps(same).encode()).hexdigest()[:12]
+    pieces = configs[0].folder.parent / f"{UNFINISHED}{mark}"
+    with claimed(pieces), farewell(lambda: f"stopped; what is finished is kept, {GO_ON}"):
+        outcomes = adapt_all(world, env, policy, tasks, configs, Journal(pieces))
+        for settings, outcome in zip(configs, outcomes, strict=True):
+            save_outcome(settings.folder, settings, env, policy, tasks, outcome)
+        shutil.rmtree(pieces)
 
 
 def table4(config: ReproduceConfig) -> list[Line]:
@@ -115,7 +134,8 @@ def table4(config: ReproduceConfig) -> list[Line]:
     adapted(config, None, constants)
     lines = [(f"K = {hyper.max_goals}", path) for path, hyper in lengths.items()]
     lines += [(f"c = {hyper.c:.0f}", path) for path, hyper in constants.items()]
-    return [Line(label, path, paper_value("table4", config.env, label)) for label, path in lines]
+    home = envs.find(config.env).home
+    return [Line(label, path, paper_value("table4", home, label)) for label, path in lines]
 
 
 def chosen(config: ReproduceConfig, names: Sequence[str]) -> Sequence[str]:
@@ -138,7 +158,7 @@ def compared(
         policy = policy_of(name)
         results = config.folder / config.what / f"{policy.parent.name}-{config.seeds}seeds"
         adapted(config, policy, {results: UcbHyper()})
-        paper = paper_value(config.what, config.env, name)
+        paper = paper_value(config.what, envs.find(config.env).home, name)
         lines.append(Line(label.format(name), results, paper))
     return lines
 
@@ -157,7 +177,8 @@ def table5(config: ReproduceConfig) -> list[Line]:
     names = demonstrators(config)
     if len(names) < 2:
         raise UsageError(
-            f"there is no table5 for {config.env}: it compares datasets of several demonstrators"
+            f"there is no table5 for {config.env}: it compares datasets of several demonstrators; "
+            "name another world with --env"
         )
     return compared(config, sorted(names), lambda name: trained(config, name, name))
 
@@ -181,7 +202,8 @@ def heads(config: ReproduceConfig) -> list[Line]:
     """
     if envs.make(config.env).spec.discrete:
         raise UsageError(
-            f"there is no heads for {config.env}: it compares distributions of continuous actions"
+            f"there is no heads for {config.env}: it compares distributions of continuous actions; "
+            "name another world with --env"
         )
     names = [name for name in HEADS if name != "categorical"]
     return compared(config, names, lambda head: trained(config, head, head=head))
@@ -195,17 +217,24 @@ MAKE: dict[str, Callable[[ReproduceConfig], list[Line]]] = {
 }
 
 
+def files_of(config: ReproduceConfig) -> tuple[Path, Path]:
+    """Where the table and the curves of an ablation are written."""
+    place = config.folder / config.what
+    return place.with_name(f"{config.what}.md"), place.with_name(f"{config.what}.png")
+
+
 def as_table(lines: Sequence[Line]) -> str:
     """The table in Markdown, one row for each line."""
     head = ["", "initial", "final (mean ± std over seeds)", "regret", "after 40", "paper: final"]
     rows = []
     for line in lines:
         summary = read_summary(line.results)
+        final = SeedSpread(summary["final_return"], summary["final_return_std_over_seeds"])
         rows.append(
             [
                 line.label,
                 f"{summary['initial_return']:.2f}",
-                f"{summary['final_return']:.3f} ± {summary['final_return_std_over_seeds']:.3f}",
+                str(final),
                 number(summary["regret"]),
                 number(summary["regret_after_40"]),
                 line.paper,
@@ -214,7 +243,9 @@ def as_table(lines: Sequence[Line]) -> str:
     return table(head, rows)
 
 
-def draw(lines: Sequence[Line], title: str, path: Path) -> None:
-    """The learning curves of the lines."""
+def save(config: ReproduceConfig, text: str, lines: Sequence[Line]) -> None:
+    """Write the table and the learning curves of an ablation."""
+    place, picture = files_of(config)
     results = {line.label: load_results(line.results) for line in lines}
-    learning_curve(results, title).savefig(path)
+    write(picture, later(learning_curve, results, config.env))
+    write_sealed(place, lambda path: path.write_text(text, encoding="utf-8"))

@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 
 from envs.base import Environment, Task
+from envs.errors import UsageError
 from envs.registry import World
-from experiments.store.results import Results, results_of, save_results
+from experiments.store.policies import check_weights
+from experiments.store.provenance import provenance
+from experiments.store.results import Results, load_results, results_of, save_results, write_results
 from experiments.store.settings import AdaptConfig
 from experiments.store.summary import summarize
+from experiments.store.work import long_work
 from mgpo_jax import methods
-from mgpo_jax.files import to_json
+from mgpo_jax.files import hash_arrays, to_json
+from mgpo_jax.journal import Journal
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.runner import Outcome, sweep
-from mgpo_jax.tasks import evaluation_tasks, load_tasks, test_tasks
+from mgpo_jax.tasks import evaluation_tasks, load_tasks, task_arrays, test_tasks
 
 
 def chosen_tasks(world: World, env: Environment, path: Path | None, validation: bool) -> Task:
@@ -34,8 +40,12 @@ def adapt_all(
     policy: LoadedPolicy,
     tasks: Task,
     configs: Sequence[AdaptConfig],
+    journal: Journal | None = None,
 ) -> list[Outcome]:
-    """One outcome for each config; they may differ in the method's hyper-parameters only."""
+    """One outcome for each config; they may differ in the method's hyper-parameters only.
+
+    What is finished is kept in ``journal``.
+    """
     first = configs[0]
     judged = world.judged
     if first.eval_episodes is not None:
@@ -52,7 +62,30 @@ def adapt_all(
         eval_every=first.eval_every,
         judged=judged,
         keep_actions=first.keep_actions,
+        journal=journal,
     )
+
+
+NO_SETTINGS = ("debug", "figures", "out", "policy", "resume", "tasks")
+"""Settings of the command that do not decide about its results, or whose content is hashed instead."""
+
+
+def deciding(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of a command that decide about its results."""
+    return {name: value for name, value in config.items() if name not in NO_SETTINGS}
+
+
+def finished(folder: Path, config: AdaptConfig, policy: LoadedPolicy) -> Results:
+    """The results of an adaptation that ended before it was resumed.
+
+    Raises:
+      UsageError: if they are of other settings.
+    """
+    results = load_results(folder)
+    check_weights(results, policy, f"remove {folder}, or choose another with --out")
+    if deciding(results.config) != deciding(to_json(config)):
+        raise UsageError(f"{folder} holds results of other settings; choose another with --out")
+    return results
 
 
 def adapt_and_save(
@@ -64,8 +97,14 @@ def adapt_and_save(
     tasks: Task,
 ) -> Results:
     """Adapt to all tasks as an ``AdaptConfig`` says, and write the results to a new folder."""
-    (outcome,) = adapt_all(world, env, policy, tasks, [config])
-    return save_outcome(folder, config, env, policy, tasks, outcome)
+    settings = deciding(to_json(config))
+    settings["policy_sha256"] = policy.sha256
+    settings["tasks_sha256"] = hash_arrays(task_arrays(tasks))
+    with long_work(folder, settings, provenance(), config.resume) as (place, journal):
+        (outcome,) = adapt_all(world, env, policy, tasks, [config], journal)
+        results = results_with_summary(config, env, policy, tasks, outcome)
+        write_results(place, results, folder)
+    return results
 
 
 def save_outcome(
@@ -75,8 +114,15 @@ def save_outcome(
     policy: LoadedPolicy,
     tasks: Task,
     outcome: Outcome,
-) -> Results:
+) -> None:
     """Write the results of an adaptation to a new folder."""
+    save_results(folder, results_with_summary(config, env, policy, tasks, outcome))
+
+
+def results_with_summary(
+    config: AdaptConfig, env: Environment, policy: LoadedPolicy, tasks: Task, outcome: Outcome
+) -> Results:
+    """The results of an adaptation that was just run, with the numbers that tables show."""
     optimum = np.asarray(jax.jit(jax.vmap(env.optimal_return))(tasks))
     results = results_of(outcome, to_json(config), env, tasks, optimum)
     summary = summarize(
@@ -86,6 +132,4 @@ def save_outcome(
         num_failed=outcome.num_failed,
         cpu_seconds=outcome.cpu_seconds,
     )
-    results = dataclasses.replace(results, summary=summary)
-    save_results(folder, results)
-    return results
+    return dataclasses.replace(results, summary=summary)

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
 from functools import cache
 from itertools import count, islice
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
-from tqdm import tqdm
 
 import envs
 from envs.base import Demonstrator, Environment, Episode
@@ -21,13 +25,19 @@ from envs.episodes import run_episode
 from envs.errors import DataError, UsageError, nearest
 from envs.registry import World
 from experiments.runtime import refuse_existing
-from experiments.store.provenance import versions
+from experiments.store.provenance import provenance, versions
 from experiments.store.settings import CollectConfig, PretrainConfig, dataset_folder
-from mgpo_jax.dataset import STEP_ARRAYS, Dataset, hash_task, load_dataset, save_dataset
+from experiments.store.work import long_work
+from mgpo_jax.claims import check_place
+from mgpo_jax.dataset import STEP_ARRAYS, Dataset, hash_task, load_dataset, write_dataset
+from mgpo_jax.files import ExistsError
+from mgpo_jax.journal import Journal
+from mgpo_jax.progress import Progress
 from mgpo_jax.runner import together
 from mgpo_jax.sharding import fetch
 from mgpo_jax.tasks import benchmark_tasks, task_hashes
 
+SMALLEST_TRAJECTORY = 200  # bytes on disk, to see whether a dataset has a chance to fit
 MAX_TRIES = 20  # at one demonstration
 BATCH = 250  # episodes at once: enough to fill the vector units, few enough to stay in cache
 
@@ -124,48 +134,89 @@ def _rows(found: Demonstration, hashes: np.ndarray, rows: np.ndarray) -> dict[st
     }
 
 
+def _record(
+    found: Demonstration, indices: np.ndarray, forbidden: np.ndarray, room: int
+) -> dict[str, np.ndarray]:
+    """What is kept of a batch of demonstrations: ``room`` of them at most, and what became of the rest."""
+    hashes = np.array([hash_task(one) for one in found.fingerprint], np.uint64)
+    unseen = ~np.isin(hashes, forbidden)
+    return {
+        **_rows(found, hashes, np.flatnonzero(unseen & found.good)[:room]),
+        "again": indices[unseen & ~found.good],
+        "num_failed": np.sum(found.episode.failed),
+        "num_test": np.sum(~unseen),
+    }
+
+
+def _batches(
+    env: Environment,
+    demonstrator: Demonstrator,
+    num: int,
+    seed: int,
+    forbidden: np.ndarray,
+    attempts: _Attempts,
+    journal: Journal,
+) -> Iterator[dict[str, np.ndarray]]:
+    """Records of batches of attempts, until they hold ``num`` demonstrations to keep."""
+    demonstrate = program_of(env, demonstrator)
+    num_kept = fruitless = 0
+    for batch in count():
+        indices, name = attempts.next_batch(), f"batch{batch:06}"
+        record = journal.read(name)
+        if record is None:
+            keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), batch), BATCH)
+            found = fetch(demonstrate(keys, indices, demonstrator.weights))
+            record = _record(found, indices, forbidden, num - num_kept)
+            journal.write(name, record)
+        attempts.failed(record.pop("again"))
+        num_new = len(record["lengths"])
+        yield record
+        num_kept += num_new
+        if num_kept >= num:
+            return
+        fruitless = 0 if num_new else fruitless + 1
+        if fruitless >= MAX_TRIES:
+            raise DataError(
+                f"nothing to keep in {MAX_TRIES * BATCH} attempts: nearly every task of "
+                f"{env.spec.name} is a test task or its demonstrations are dropped"
+            )
+
+
 def collect(
     env: Environment,
     demonstrator: Demonstrator,
     num: int,
     seed: int,
     num_test_tasks: int,
+    journal: Journal | None = None,
 ) -> tuple[Dataset, dict[str, Any]]:
     """Demonstrations, none of them of a test task, and facts about them.
 
     Those that are not worth keeping are tried again with another key, so that a demonstrator that goes
     through all tasks in turn demonstrates each of them equally often, but for the last batch.
 
+    Args:
+      env: the world.
+      demonstrator: who demonstrates.
+      num: how many demonstrations to keep.
+      seed: seed of tasks and demonstrator.
+      num_test_tasks: how many tasks of the world are kept for test.
+      journal: where finished batches are kept; those that it holds are not run again.
+
     Raises:
       DataError: if the demonstrator fails ``MAX_TRIES`` times at one of them.
     """
-    demonstrate = program_of(env, demonstrator)
-    forbidden = task_hashes(env, benchmark_tasks(env, num_test_tasks))
     attempts = _Attempts(env.spec.name)
+    forbidden = task_hashes(env, benchmark_tasks(env, num_test_tasks))
     kept: list[dict[str, np.ndarray]] = []
-    num_kept = num_test = num_failed = fruitless = 0
-    with tqdm(total=num, unit="trajectory", disable=None) as progress:
-        for batch in count():
-            keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), batch), BATCH)
-            indices = attempts.next_batch()
-            found = fetch(demonstrate(keys, indices, demonstrator.weights))
-            hashes = np.array([hash_task(one) for one in found.fingerprint], np.uint64)
-            unseen = ~np.isin(hashes, forbidden)
-            attempts.failed(indices[unseen & ~found.good])
-            rows = np.flatnonzero(unseen & found.good)[: num - num_kept]
-            kept.append(_rows(found, hashes, rows))
-            num_kept += len(rows)
-            num_failed += int(found.episode.failed.sum())
-            num_test += int((~unseen).sum())
-            progress.update(len(rows))
-            if num_kept >= num:
-                break
-            fruitless = 0 if len(rows) else fruitless + 1
-            if fruitless >= MAX_TRIES:
-                raise DataError(
-                    f"nothing to keep in {MAX_TRIES * BATCH} attempts: nearly every task of "
-                    f"{env.spec.name} is a test task or its demonstrations are dropped"
-                )
+    num_test = num_failed = 0
+    with Progress(num, "trajectory") as progress:
+        batches = _batches(env, demonstrator, num, seed, forbidden, attempts, journal or Journal())
+        for record in batches:
+            num_failed += int(record.pop("num_failed"))
+            num_test += int(record.pop("num_test"))
+            kept.append(record)
+            progress.update(len(record["lengths"]))
     arrays = {name: np.concatenate([part[name] for part in kept]) for name in kept[0]}
     returns = arrays.pop("returns")
     dataset = Dataset(**arrays)
@@ -190,29 +241,41 @@ def _describe(values: np.ndarray) -> dict[str, Any]:
     }
 
 
-def collect_and_save(config: CollectConfig) -> None:
+def collect_and_save(config: CollectConfig, wait: bool = False) -> None:
     """Collect a dataset and write it to its folder.
 
+    Args:
+      config: settings of the command.
+      wait: wait for another process that collects the same dataset.
+
     Raises:
-      UsageError: if the folder exists.
+      DataError: if the folder exists, or another process makes it.
+      UsageError: if there is no such demonstrator, or unfinished work that ``--resume`` does not ask for.
     """
     world, env = envs.find(config.env), envs.make(config.env)
     name, demonstrator = find_demonstrator(world, env, config.demonstrator)
     folder = dataset_folder(config, name)
-    refuse_existing(folder, "remove it", "choose another with --out")
-    cpu = time.process_time()
-    dataset, facts = collect(
-        env, demonstrator, config.trajectories, config.seed, world.num_test_tasks
-    )
-    cpu = time.process_time() - cpu
     made = {
         "env": config.env,
         "policy": name,
         "settings": dict(demonstrator.settings),
         "seed": config.seed,
-        "versions": versions(),
     }
-    save_dataset(folder, dataset, {**made, **facts})
+    asked = {**made, "trajectories": config.trajectories}
+    if config.resume and os.path.isdir(folder):
+        load_dataset(folder, env.spec, {**made, "num_trajectories": config.trajectories})
+        print(f"{folder} is finished already", file=sys.stderr)
+        return
+    if not wait:
+        refuse_existing(folder, "remove it", "choose another with --out")
+    check_place(folder, num_bytes=config.trajectories * SMALLEST_TRAJECTORY)
+    with long_work(folder, asked, provenance(), config.resume, wait) as (place, journal):
+        cpu = time.process_time()
+        dataset, facts = collect(
+            env, demonstrator, config.trajectories, config.seed, world.num_test_tasks, journal
+        )
+        cpu = time.process_time() - cpu
+        write_dataset(place, dataset, {**made, "versions": versions(), **facts})
     length, return_ = facts["length"]["mean"], facts["hindsight_return"]["mean"]
     print(
         f"{folder}: {len(dataset)} trajectories, {dataset.lengths.sum()} steps\n"
@@ -223,8 +286,13 @@ def collect_and_save(config: CollectConfig) -> None:
     )
 
 
-def prepare_dataset(config: PretrainConfig, world: World, env: Environment) -> Dataset:
-    """The dataset of a training, collected first where it is not there yet; no test task is in it.
+def prepare_dataset(
+    config: PretrainConfig, world: World, env: Environment
+) -> tuple[Dataset, Path, str]:
+    """The dataset of a training, its folder and its hash; no test task is in it.
+
+    It is collected first where it is not there yet. Where another process collects it, that one is waited
+    for.
 
     Raises:
       DataError: if the dataset there is damaged, out of date or holds a test task.
@@ -239,10 +307,17 @@ def prepare_dataset(config: PretrainConfig, world: World, env: Environment) -> D
     )
     folder = dataset_folder(wanted, name)
     if not folder.exists():
-        text = f"no dataset in {folder} yet: collecting {wanted.trajectories} trajectories"
+        text = f"no dataset in {folder} yet: {wanted.trajectories} trajectories are collected first"
         print(text, file=sys.stderr)
-        collect_and_save(wanted)
-    dataset, manifest = load_dataset(folder, env.spec)
+        with suppress(ExistsError):  # another process has collected it meanwhile
+            collect_and_save(replace(wanted, resume=True), wait=True)
+    made = {
+        "env": config.env,
+        "policy": name,
+        "seed": wanted.seed,
+        "num_trajectories": wanted.trajectories,
+    }
+    dataset, manifest = load_dataset(folder, env.spec, made)
     settings, made_with = dict(demonstrator.settings), manifest.get("settings", {})
     if made_with != settings:
         raise DataError(
@@ -256,4 +331,4 @@ def prepare_dataset(config: PretrainConfig, world: World, env: Environment) -> D
         raise UsageError(
             f"--holdout {config.holdout} leaves nothing of {len(dataset)} trajectories"
         )
-    return dataset
+    return dataset, folder, manifest["sha256"]

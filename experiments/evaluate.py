@@ -6,13 +6,14 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import tyro
 
 from envs.errors import UsageError
-from experiments.runtime import Common, refuse_existing, run
-from mgpo_jax.settings import number
+from experiments.runtime import Common, refuse_existing_file, run, say
+from experiments.signals import farewell
+from mgpo_jax.settings import Name, NotNegative, NumEpisodes, Seed
 
 
 @dataclass(frozen=True)
@@ -21,16 +22,18 @@ class EvaluateConfig(Common):
 
     runs: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Result folders of adaptations."""
-    env: str | None = None
+    env: Name | None = None
     """Evaluate in another world that has the same tasks (default: where the prompts were found)."""
-    obs_noise: tuple[float, ...] = ()
+    obs_noise: tuple[NotNegative, ...] = ()
     """Standard deviations of noise on observations, in their units; a row for each."""
-    action_noise: tuple[float, ...] = ()
+    action_noise: tuple[NotNegative, ...] = ()
     """Standard deviations of noise on actions; where they are discrete, probabilities of a random one."""
-    episodes: int = number(10, at_least=1)
+    episodes: NumEpisodes = 10
     """Episodes under each prompt, judged as the world's record says."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the noise."""
+    policy: Path | None = None
+    """Folder of the policy that the results were found with, where it is no longer at its place."""
     json: Path | None = None
     """Also write the rows to this file."""
 
@@ -42,21 +45,28 @@ def main(config: EvaluateConfig) -> None:
             "no result folder given; usage: python -m experiments.evaluate RUN_DIR ..."
         )
     if config.json:
-        if not config.json.parent.is_dir():
-            raise UsageError(f"no folder {config.json.parent} to write {config.json.name} to")
-        refuse_existing(config.json, "remove it", "choose another with --json")
-    from experiments.evaluation import HEAD, cells, evaluate_case, noises, open_case
+        refuse_existing_file(config.json, "--json")
+    from experiments.evaluation import HEAD, cells, evaluate_cases, noises, open_case
     from experiments.store.provenance import provenance
     from experiments.store.tables import table
     from mgpo_jax.files import write_json
 
     sizes = noises(config.obs_noise, config.action_noise)
-    cases = [open_case(folder, config.env, sizes) for folder in config.runs]
-    rows = [row for case in cases for row in evaluate_case(case, config.episodes, config.seed)]
-    print(table(HEAD, [cells(row) for row in rows]))
+    cases = [open_case(folder, config.env, sizes, config.policy) for folder in config.runs]
+    rows: list[dict[str, Any]] = []
+
+    def unfinished() -> str:
+        if rows:
+            say(table(HEAD, [cells(row) for row in rows]))
+        return f"stopped after {len(rows)} rows; run it again for the others"
+
+    with farewell(unfinished):
+        for row in evaluate_cases(cases, config.episodes, config.seed):
+            rows.append(row)
+    say(table(HEAD, [cells(row) for row in rows]))
     if num_failed := sum(row["failed_episodes"] for row in rows):
         total = sum(row["num_episodes"] for row in rows)
-        print(f"{num_failed} of {total} episodes ended because the world broke down")
+        say(f"{num_failed} of {total} episodes ended because the world broke down")
     if config.json:
         write_json(config.json, {"rows": rows, **provenance()})
         print(f"rows in {config.json}", file=sys.stderr)

@@ -7,18 +7,19 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from tqdm import tqdm
 
 import envs
 from envs.base import Environment, Task
-from envs.errors import UsageError
-from envs.registry import World
+from envs.errors import DataError, UsageError
+from envs.registry import WORLDS, World
 from envs.wrappers import Noisy
+from experiments.store.layout import TASKS
 from experiments.store.policies import load_policy_of
 from experiments.store.results import Results, load_results
-from experiments.store.statistics import seed_spread
+from experiments.store.statistics import SeedSpread, seed_spread
 from mgpo_jax.optimizers.methods import judged_query
 from mgpo_jax.policy import LoadedPolicy
+from mgpo_jax.progress import Progress
 from mgpo_jax.prompts import Prompt
 from mgpo_jax.runner import evaluate
 from mgpo_jax.tasks import tasks_from
@@ -38,6 +39,7 @@ class Noise(NamedTuple):
 class Case(NamedTuple):
     """An adaptation, its tasks and policy, and the worlds that its prompts go to."""
 
+    folder: Path
     result: Results
     env: str
     """Name of the world."""
@@ -54,34 +56,74 @@ def noises(obs: Sequence[float], action: Sequence[float]) -> list[Noise]:
     return of_obs + [Noise(action=size) for size in action] or [Noise()]
 
 
-def open_case(folder: Path, env_name: str | None, sizes: Sequence[Noise]) -> Case:
-    """Read an adaptation, and check that policy, tasks and noise fit the world."""
+def open_case(
+    folder: Path, env_name: str | None, sizes: Sequence[Noise], policy: Path | None = None
+) -> Case:
+    """Read an adaptation, and check that policy, tasks and noise fit the world.
+
+    Args:
+      folder: the results.
+      env_name: the world to evaluate in (default: where the prompts were found).
+      sizes: the noises.
+      policy: folder of the policy (default: where it lay when the results were made).
+    """
+    if env_name is not None:
+        envs.find(env_name)  # from now on results may name its place
     result = load_results(folder)
     if "prompt.goals" not in result.best:
         raise UsageError(f"{folder} is of {result.method}, which has no prompts to evaluate")
     name = env_name or result.env
     world, env = envs.find(name), envs.make(name)
-    tasks = tasks_from(result.tasks, env, folder)
+    try:
+        tasks = tasks_from(result.tasks, env, folder / TASKS)
+    except DataError:
+        if name == result.env:
+            raise
+        raise UsageError(_no_such_tasks(name, result.env)) from None
     try:
         behind = [(noise, Noisy(env, noise.obs, noise.action)) for noise in sizes]
     except ValueError as error:
-        raise UsageError(str(error)) from None
-    return Case(result, name, world, behind, tasks, load_policy_of(result, world))
+        flag = "--action-noise" if any(noise.action for noise in sizes) else "--obs-noise"
+        raise UsageError(f"{flag}: {error}; give another size") from None
+    loaded = load_policy_of(result, world, policy)
+    return Case(folder, result, name, world, behind, tasks, loaded)
 
 
-def evaluate_case(case: Case, episodes: int, seed: int) -> Iterator[dict[str, Any]]:
-    """The optimized prompts of one adaptation, a row for each noise."""
+def _no_such_tasks(name: str, where: str) -> str:
+    """What is wrong with a world that has other tasks than the one where prompts were found."""
+    home = envs.find(where).home
+    fitting = [world.name for world in WORLDS.usable() if world.home == home]
+    return (
+        f"--env {name} cannot run the tasks of {where}, where the prompts were found; worlds that can: "
+        f"{', '.join(fitting) or where}"
+    )
+
+
+def evaluate_cases(cases: Sequence[Case], episodes: int, seed: int) -> Iterator[dict[str, Any]]:
+    """The optimized prompts of some adaptations, a row for each noise."""
+    with Progress(sum(len(case.behind) for case in cases), "row") as progress:
+        for case in cases:
+            for row in _evaluate_case(case, episodes, seed):
+                progress.update()
+                yield row
+
+
+def _evaluate_case(case: Case, episodes: int, seed: int) -> Iterator[dict[str, Any]]:
     result = case.result
     last = (slice(None), slice(None), -1)
     parts = (jnp.asarray(result.best[name][last]) for name in ("prompt.goals", "prompt.mask"))
     queries = judged_query(Prompt(*parts), case.world.judged)
     before = seed_spread(result.eval_returns[last])
-    for noise, env in tqdm(case.behind, unit="noise", disable=None):
+    for noise, env in case.behind:
         returns, num_failed = evaluate(
             env, case.policy, case.tasks, queries, episodes=episodes, seed=seed
         )
         now = seed_spread(returns)
         yield {
+            "folder": str(case.folder),
+            "num_tasks": returns.shape[1],
+            "num_seeds": returns.shape[0],
+            "episodes": episodes,
             "env": case.env,
             "optimizer": result.method,
             "noise": str(noise),
@@ -96,16 +138,21 @@ def evaluate_case(case: Case, episodes: int, seed: int) -> Iterator[dict[str, An
         }
 
 
-HEAD = ("env", "method", "adapted", "noise", "return (mean ± std over seeds)", "change")
+HEAD = (
+    "folder", "env", "method", "tasks x seeds x episodes", "adapted", "noise",
+    "return (mean ± std over seeds)", "change",
+)  # fmt: skip
 
 
 def cells(row: dict[str, Any]) -> list[str]:
     """A row as it is printed."""
     return [
+        row["folder"],
         row["env"],
         row["optimizer"],
+        f"{row['num_tasks']} x {row['num_seeds']} x {row['episodes']}",
         f"{row['adapted']:.3f}",
         row["noise"],
-        f"{row['return']:.3f} ± {row['std_over_seeds']:.3f}",
+        str(SeedSpread(row["return"], row["std_over_seeds"])),
         f"{row['change']:+.3f}",
     ]

@@ -8,7 +8,7 @@ from typing import NoReturn
 
 from envs.errors import UsageError
 from envs.registry import WORLDS
-from experiments.runtime import Common, run
+from experiments.runtime import Common, run, say
 from mgpo_jax.methods import METHODS
 
 
@@ -21,15 +21,15 @@ def main(config: ListConfig) -> None:
     """List the worlds and methods that are known by name."""
     del config
     for title, registry in (("worlds (--env)", WORLDS), ("methods (--method)", METHODS)):
-        print(title)
+        say(title)
         for name in registry.names():
             try:
                 summary = registry.find(name).summary
             except UsageError as error:  # of a package that is installed beside this one
                 summary = str(error)
-            print(f"  {name:<16} {summary}")
-        print()
-    print("Others are given as module:attribute, such as --env my_package.my_world:WORLD.")
+            say(f"  {name:<16} {summary}")
+        say("")
+    say("Others are given as module:attribute, such as --env my_package.my_world:WORLD.")
 
 
 def command(argv: Sequence[str] | None = None) -> NoReturn:

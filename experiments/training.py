@@ -2,43 +2,42 @@
 
 from __future__ import annotations
 
-import signal
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import fields, replace
-from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
-from tqdm import tqdm
 
 import envs
 from envs.base import Demonstrator, Environment, Task
 from envs.episodes import run_episode
-from envs.errors import UsageError
 from envs.registry import World
 from experiments.datasets import find_demonstrator, prepare_dataset
 from experiments.figures import training_curve
-from experiments.store.metrics import METRICS, Metrics, read_metrics
+from experiments.signals import Stopped, asked_to_stop
+from experiments.store import runs
+from experiments.store.metrics import Metrics, check_loggers
 from experiments.store.provenance import provenance
-from experiments.store.settings import PretrainConfig, saved_pretraining
-from mgpo_jax.checkpoint import checkpoints, restore_state, save_state
+from experiments.store.settings import PretrainConfig
+from mgpo_jax.checkpoint import Snapshot, checkpoints, restore_state, save_state
+from mgpo_jax.claims import claimed
 from mgpo_jax.dataset import BatchPlan, Dataset
-from mgpo_jax.files import read_object, to_json, write_json
+from mgpo_jax.files import remove_unfinished, to_json, written
 from mgpo_jax.policy import transformer_policy
 from mgpo_jax.policy_files import save_policy
+from mgpo_jax.progress import Progress
 from mgpo_jax.prompts import Prompt, sample_prompt, single_goal
 from mgpo_jax.rollout import Query, rollout
 from mgpo_jax.runner import together
-from mgpo_jax.sharding import device_mesh, fetch, largest_divisor
+from mgpo_jax.sharding import device_mesh, largest_divisor
 from mgpo_jax.tasks import EVAL_SEED, evaluation_tasks
-from mgpo_jax.training import Trainer, TrainState, batch_stream
+from mgpo_jax.training import Trainer, TrainState, batch_stream, diverged, finite_metrics
 from mgpo_jax.transformer import TransformerConfig, network_config
 
 CONSTANT = 1e-4  # below this standard deviation a component of an observation stays unscaled
@@ -118,58 +117,20 @@ class GreedyEvaluation:
         return found
 
 
-@contextmanager
-def stop_request() -> Iterator[Callable[[], bool]]:
-    """Turns Ctrl-C and SIGTERM into a request that is met between two gradient steps."""
-    asked: list[int] = []
-
-    def ask(number: int, frame: FrameType | None) -> None:
-        if asked:
-            raise KeyboardInterrupt  # the second time, at once
-        asked.append(number)
-
-    before = {s: signal.signal(s, ask) for s in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: bool(asked)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def open_run(config: PretrainConfig) -> Path:
-    """The run folder: a new one, or with ``--resume`` one made with the same settings.
-
-    Raises:
-      UsageError: if there is no run to resume, or it was started with other settings.
-    """
-    folder = config.folder
-    saved = folder / "config.json"
-    if not config.resume:
-        folder.mkdir(parents=True)
-        write_json(saved, config)
-        write_json(folder / "meta.json", provenance())
-        return folder
-    if not saved.is_file():
-        raise UsageError(f"no run to resume in {folder}; start it without --resume")
-    before = saved_pretraining(read_object(saved), saved)
-    now = to_json(replace(config, resume=False, debug=False))
-    before = {**to_json(PretrainConfig()), **before, "debug": False}
-    changed = [f"{name} {before[name]} -> {now[name]}" for name in now if now[name] != before[name]]
-    if changed:
-        raise UsageError(f"{folder} was started with other settings: {'; '.join(changed)}")
-    return folder
-
-
 class Run:
-    """A training under way: the trainer, what measures it, and where its metrics go."""
+    """A training under way: the trainer, what measures it, and where its metrics go.
+
+    Its folder is claimed, so that no other process works in it.
+    """
 
     def __init__(self, config: PretrainConfig) -> None:
-        self.config = config
+        self.config, self.folder = config, config.folder
         world, env = envs.find(config.env), envs.make(config.env)
         network_config(env.spec, config.head, encoder=config.encoder)  # complains about a bad one
-        dataset = prepare_dataset(config, world, env)
+        check_loggers(config)
+        meta = provenance()
+        dataset, place, sha256 = prepare_dataset(config, world, env)
         self.network = configured_network(config, env, dataset)
-        self.folder = open_run(config)
         self.mesh = device_mesh(largest_divisor(config.train.part_size, len(jax.devices())))
         cut = len(dataset) - config.holdout
         self.fit, held_out = dataset.slice(0, cut), dataset.slice(cut, len(dataset))
@@ -179,6 +140,12 @@ class Run:
         self._held_out_parts = self._validation_parts(held_out, env.spec.horizon)
         _, demonstrator = find_demonstrator(world, env, config.data.demonstrator)
         self._greedy = GreedyEvaluation(world, env, self.network, demonstrator, config.eval_tasks)
+        self.identity = runs.identity(config, sha256)
+        meta = {**meta, "dataset": str(place), "dataset_sha256": sha256}
+        if runs.has_begun(self.folder):
+            runs.check_same(config, meta)
+        else:  # only now, after everything that could be wrong with the settings
+            runs.begin(config, meta)
 
     def _validation_parts(self, held_out: Dataset, horizon: int) -> list[BatchPlan]:
         """Draws of one padded length; the validation loss is of the same ones every time."""
@@ -187,10 +154,18 @@ class Run:
         )
         return next(batch_stream(plan, held_out, self.truncate))
 
-    def measure(self, params: Any) -> dict[str, float]:
-        """Losses on held-out trajectories and greedy returns."""
-        held = self.trainer.evaluate(params, self._held_out_parts, self._held_out)
-        return {**{f"val/{k}": v for k, v in held.items()}, **self._greedy(params)}
+    def measure(self, state: TrainState) -> dict[str, float]:
+        """Losses on held-out trajectories and greedy returns.
+
+        Raises:
+          DataError: if one of them is not finite.
+        """
+        held = self.trainer.evaluate(state.params, self._held_out_parts, self._held_out)
+        found = {**{f"val/{k}": v for k, v in held.items()}, **self._greedy(state.params)}
+        for name, value in found.items():
+            if not np.isfinite(value):
+                raise diverged(state.step, name, value)
+        return found
 
     def batches(self, first_step: int) -> Iterator[list[BatchPlan]]:
         """The batches of the run from a step on."""
@@ -203,53 +178,81 @@ class Run:
         )
 
 
-def train(config: PretrainConfig) -> None:
+def train(config: PretrainConfig, go_on: str = "continue with --resume") -> None:
     """Run or continue a training to its end and write the policy.
 
+    Args:
+      config: settings of the run.
+      go_on: what continues it after a stop, for messages.
+
     Raises:
-      KeyboardInterrupt: if it was asked to stop; the state is saved.
+      Stopped: if it was asked to stop; the state is saved.
+      DataError: if a loss, weight or return is not finite; the last sound checkpoint is kept.
     """
-    run = Run(config)
-    with checkpoints(run.folder / "checkpoints") as manager, stop_request() as stopping:
-        state = run.trainer.init()
-        if config.resume:
-            state = restore_state(manager, state) or state
-            print(f"resuming {run.folder} at step {state.step}", file=sys.stderr)
-        metrics = Metrics(run.folder, config, state.step)
-        state = _take_steps(run, state, metrics, manager, stopping)
-    made = {"env": config.env, "config": to_json(config), "steps": state.step}
-    save_policy(run.folder / "policy", run.network, state.params, made)
-    training_curve(read_metrics(run.folder / METRICS)).savefig(run.folder / "training.png")
-    print(f"policy written to {run.folder / 'policy'}", file=sys.stderr)
+    with claimed(config.folder):
+        remove_unfinished(config.folder)
+        run = Run(config)
+        with checkpoints(run.folder / runs.CHECKPOINTS) as manager:
+            blank = run.trainer.init()
+            before = restore_state(manager, blank, run.identity) if config.resume else None
+            before = before or Snapshot(blank, [], [])
+            if config.resume:
+                step = before.state.step
+                print(f"resuming {run.folder} at step {step}", file=sys.stderr)
+            metrics = Metrics(run.folder, config, before.measured)
+            with asked_to_stop() as stopping:
+                state = _take_steps(run, before, metrics, manager, stopping, go_on)
+        made = {"env": config.env, "config": to_json(config), "steps": state.step}
+        policy = run.folder / runs.POLICY
+        shutil.rmtree(policy, ignore_errors=True)  # of a finished run that is resumed
+        save_policy(policy, run.network, state.params, made)
+        with written(run.folder / "training.png") as picture:
+            training_curve(metrics.rows).savefig(picture)
+    print(f"policy written to {policy}", file=sys.stderr)
 
 
 def _take_steps(
-    run: Run, state: TrainState, metrics: Metrics, manager: Any, stopping: Callable[[], bool]
+    run: Run,
+    before: Snapshot,
+    metrics: Metrics,
+    manager: Any,
+    stopping: Callable[[], int],
+    go_on: str,
 ) -> TrainState:
     """All gradient steps that are left, with checkpoints and evaluations on the way."""
-    config, num_steps = run.config, run.config.train.steps
+    config, num_steps, state = run.config, run.config.train.steps, before.state
     batches = run.batches(state.step)
-    pending: list[dict[str, Array]] = []
-    clock = time.process_time()
-    with tqdm(total=num_steps, initial=state.step, unit="step", disable=None) as progress:
+    # Means are taken in float32, also of what comes from a checkpoint.
+    pending = [{k: np.float32(v) for k, v in row.items()} for row in before.pending]
+    newest: list[tuple[int, dict[str, Array]]] = []  # the step whose figures are not looked at yet
+    clock, since = time.process_time(), state.step
+    with Progress(num_steps, "step", initial=state.step) as progress:
         while state.step < num_steps:
             state, row = run.trainer.step(state, next(batches))
-            pending.append(row)
+            pending += [finite_metrics(*step) for step in newest]  # computed by now: no waiting
+            newest = [(state.step, row)]
             progress.update()
-            done = state.step == num_steps
-            if stopping() or done or state.step % config.save_every == 0:
-                save_state(manager, state)
-            if done or state.step % config.eval_every == 0:
-                mean = _means(fetch(pending))
-                spent = {"cpu_seconds_per_step": (time.process_time() - clock) / len(pending)}
-                row_out = {**mean, **run.measure(state.params), **spent}
+            number, done = stopping(), state.step == num_steps
+            saves = number or done or state.step % config.save_every == 0
+            measures = done or state.step % config.eval_every == 0
+            if saves or measures:
+                pending += [finite_metrics(*step) for step in newest]
+                newest = []
+            if measures:
+                spent = {
+                    "cpu_seconds_per_step": (time.process_time() - clock) / (state.step - since)
+                }
+                row_out = {**_means(pending), **run.measure(state), **spent}
                 metrics.write(state.step, row_out)
-                progress.set_postfix(_shown(row_out))
-                pending, clock = [], time.process_time()
-            if stopping():
+                progress.show(_shown(row_out))
+                pending, clock, since = [], time.process_time(), state.step
+            if saves:
+                left = [{k: float(v) for k, v in row.items()} for row in pending]
+                save_state(manager, Snapshot(state, metrics.rows, left), run.identity)
+            if number and not done:
                 progress.close()
-                print(f"stopped at step {state.step}; continue with --resume", file=sys.stderr)
-                raise KeyboardInterrupt
+                text = f"stopped at step {state.step} of {num_steps}; {go_on}"
+                raise Stopped(text, number)
     return state
 
 
@@ -258,7 +261,7 @@ def _means(rows: list[dict[str, Any]]) -> dict[str, float]:
 
 
 def _shown(row: dict[str, float]) -> dict[str, str]:
-    """What the progress bar shows of a row of metrics."""
+    """What the progress shows of a row of metrics."""
     returns = {
         name.removeprefix("eval/").removesuffix("_return"): f"{value:.2f}"
         for name, value in row.items()

@@ -1,10 +1,19 @@
-"""Training checkpoints (Orbax)."""
+"""Training checkpoints (Orbax): everything that a run needs to go on as if it had never stopped.
+
+A checkpoint holds its own hash and the identity of its run, so that one that is damaged, or of another run,
+is never gone on from.
+"""
 
 from __future__ import annotations
 
+import json
+import logging
+import shutil
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,29 +21,63 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from envs.errors import DataError
+from mgpo_jax.files import hash_arrays
 from mgpo_jax.sharding import fetch
 from mgpo_jax.training import TrainState
+
+_HASH, _IDENTITY, _ROWS = "sha256", "run", "rows"  # beside the leaves of the state
+DAMAGED = "-damaged"  # ends the name of the folder where checkpoints are set aside
+
+
+class Snapshot(NamedTuple):
+    """What a checkpoint holds."""
+
+    state: TrainState
+    measured: list[dict[str, float]]
+    """The rows of metrics up to here."""
+    pending: list[dict[str, float]]
+    """The metrics of the steps since the last row."""
 
 
 @contextmanager
 def checkpoints(folder: Path, keep: int = 2) -> Iterator[ocp.CheckpointManager]:
-    """An Orbax manager whose pending saves are finished on the way out.
+    """An Orbax manager. A save is on disk when it returns.
 
-    A save becomes visible only when it is complete: a process killed in the middle of one leaves the
+    It becomes visible only when it is complete: a process killed in the middle of one leaves the
     checkpoints before it.
+
+    Raises:
+      DataError: if there is a file where the folder should be.
     """
-    options = ocp.CheckpointManagerOptions(max_to_keep=keep, create=True)
-    manager = ocp.CheckpointManager(Path(folder).absolute(), options=options)
+    folder = Path(folder).absolute()
+    if folder.exists() and not folder.is_dir():
+        raise DataError(
+            f"{folder} is no folder; remove it to start the training from its first step"
+        )
+    options = ocp.CheckpointManagerOptions(
+        max_to_keep=keep, create=True, enable_async_checkpointing=False
+    )
+    logger = logging.getLogger("absl")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)  # what matters of Orbax's warnings is said here, in one line
+    manager = ocp.CheckpointManager(folder, options=options)
     try:
         yield manager
     finally:
-        manager.wait_until_finished()
         manager.close()
+        logger.setLevel(level)
 
 
-def save_state(manager: ocp.CheckpointManager, state: TrainState) -> None:
-    """Save a training state under its step (in the background)."""
-    manager.save(state.step, args=ocp.args.StandardSave(_named_leaves(state)))
+def save_state(manager: ocp.CheckpointManager, snapshot: Snapshot, identity: str = "") -> None:
+    """Save a training under its step; ``identity`` says which run it is of (64 hexadecimal digits)."""
+    rows = {"measured": snapshot.measured, "pending": snapshot.pending}
+    saved = {
+        **_named_leaves(snapshot.state),
+        _ROWS: np.frombuffer(json.dumps(rows).encode(), np.uint8),
+        _IDENTITY: np.frombuffer(bytes.fromhex(identity or "00"), np.uint8),
+    }
+    saved[_HASH] = np.frombuffer(bytes.fromhex(hash_arrays(saved)), np.uint8)
+    manager.save(snapshot.state.step, args=ocp.args.StandardSave(saved))
 
 
 def _named_leaves(state: TrainState) -> dict[str, np.ndarray]:
@@ -43,27 +86,64 @@ def _named_leaves(state: TrainState) -> dict[str, np.ndarray]:
     return {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in leaves}
 
 
-def restore_state(manager: ocp.CheckpointManager, blank: TrainState) -> TrainState | None:
-    """The newest complete training state, or None if there is none.
+def restore_state(
+    manager: ocp.CheckpointManager, blank: TrainState, identity: str = ""
+) -> Snapshot | None:
+    """The newest sound checkpoint, or None if there is none.
+
+    Those that are damaged are set aside, with a line on stderr that says so.
 
     Raises:
-      DataError: if it cannot be read or does not fit ``blank``.
+      DataError: if it is of another run or another network.
     """
-    step = manager.latest_step()
-    if step is None:
-        return None
-    where = Path(manager.directory) / str(step)
-    try:
-        found = manager.restore(step, args=ocp.args.StandardRestore())
-    except Exception as error:  # Orbax raises many kinds
-        reason = str(error).splitlines()[0]
-        raise DataError(
-            f"checkpoint {where} is damaged ({reason}); remove it to go on from the one before"
-        ) from error
+    root = Path(manager.directory)
+    for step in sorted(manager.all_steps(), reverse=True):
+        where = root / str(step)
+        try:
+            found = {k: np.asarray(v) for k, v in _read(manager, step).items()}
+            _check_hash(found)
+        except Exception:  # Orbax raises many kinds for a damaged file
+            _set_aside(where, root.with_name(root.name + DAMAGED))
+            manager.reload()  # or it would save no step up to the one that is gone
+            continue
+        if identity and _IDENTITY in found and found[_IDENTITY].tobytes().hex() != identity:
+            raise DataError(
+                f"checkpoint {where} is of a run with other settings or data; remove {root} to train "
+                "from the first step"
+            )
+        return _snapshot(found, blank, step, where)
+    return None
+
+
+def _read(manager: ocp.CheckpointManager, step: int) -> Any:
+    return manager.restore(step, args=ocp.args.StandardRestore())
+
+
+def _check_hash(found: dict[str, np.ndarray]) -> None:
+    """Raise ``ValueError`` for arrays that are not those that were saved; old ones have no hash."""
+    saved = found.pop(_HASH, None)
+    if saved is not None and saved.tobytes().hex() != hash_arrays(found):
+        raise ValueError("hash")
+
+
+def _set_aside(checkpoint: Path, damaged: Path) -> None:
+    damaged.mkdir(exist_ok=True)
+    place = damaged / checkpoint.name
+    shutil.rmtree(place, ignore_errors=True)
+    checkpoint.rename(place)
+    print(f"checkpoint {checkpoint} is damaged; it was moved to {place}", file=sys.stderr)
+
+
+def _snapshot(found: dict[str, np.ndarray], blank: TrainState, step: int, where: Path) -> Snapshot:
+    """A checkpoint's arrays as the records that they were made of."""
+    rows: dict[str, Any] = {"measured": [], "pending": []}
+    if _ROWS in found:
+        rows = json.loads(found.pop(_ROWS).tobytes())
+    found.pop(_IDENTITY, None)
     wanted = _named_leaves(blank)
     if {k: v.shape for k, v in found.items()} != {k: v.shape for k, v in wanted.items()}:
         raise DataError(f"checkpoint {where} is of another network; start a new run with --out")
     leaves = [jnp.asarray(found[name]) for name in wanted]
     tree = jax.tree.structure((blank.params, blank.opt_state))
     params, opt_state = jax.tree.unflatten(tree, leaves)
-    return TrainState(params, opt_state, step)
+    return Snapshot(TrainState(params, opt_state, step), rows["measured"], rows["pending"])

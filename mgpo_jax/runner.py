@@ -9,6 +9,7 @@ core, or as large as a step of the world needs to be worth its call.
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,10 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, PRNGKeyArray
-from tqdm import tqdm
 
 from envs.base import Environment, Episode, Goals, Task
-from envs.errors import UsageError
+from envs.errors import DataError, UsageError
 from envs.registry import Judgement, World
 from envs.registry import find as find_world
 from mgpo_jax.adaptation import (
@@ -33,12 +33,15 @@ from mgpo_jax.adaptation import (
     proceed,
     start,
 )
+from mgpo_jax.journal import Journal
 from mgpo_jax.methods import Method, Setting, find, split_hyper, with_numbers
 from mgpo_jax.policy import LoadedPolicy, check_fits, transformer_policy
+from mgpo_jax.progress import Progress
 from mgpo_jax.rollout import Query, rollout
-from mgpo_jax.sharding import device_mesh, fetch, on_devices, replicate, split
+from mgpo_jax.sharding import device_mesh, fetch, is_key, on_devices, replicate, split
 from mgpo_jax.tasks import num_tasks
 from mgpo_jax.transformer import TransformerConfig
+from mgpo_jax.trees import numbered_leaves, with_leaves
 
 # Bytes of the agents' memories (key-value caches) in a group: what fits into the cache of a CPU's core, or
 # into the memory of an accelerator.
@@ -164,6 +167,7 @@ def sweep(
     eval_every: int = 10,
     judged: Judgement | None = None,
     keep_actions: bool = False,
+    journal: Journal | None = None,
 ) -> list[Outcome]:
     """One outcome for each variant of a method's hyper-parameters, all from one program.
 
@@ -180,10 +184,12 @@ def sweep(
       eval_every: episodes between judgements of the best choice.
       judged: how the best choice is judged (default: one greedy episode).
       keep_actions: whether to keep continuous actions; discrete ones are always kept.
+      journal: where finished segments are kept; those that it holds are not run again.
 
     Raises:
-      UsageError: if a number is below 1, or the method cannot be used in this setting.
-      DataError: if the policy was made for another world.
+      UsageError: if a number is below 1, there are no tasks, the results would not fit into memory, or the
+        method cannot be used in this setting.
+      DataError: if the policy was made for another world, or a return is not finite.
     """
     _check_positive(seeds=seeds, episodes=episodes, eval_every=eval_every)
     check_fits(policy.config, env.spec)
@@ -194,20 +200,20 @@ def sweep(
     adapter = method.adapter(setting, policy.params, hypers[0])
     segments = _segments(adapter, episodes, eval_every)
     grid = Grid(variants=len(hypers), seeds=seeds, tasks=num_tasks(tasks))
+    _check_room(env, grid, episodes)
     layout = _lay_out(env, grid.size, _memory_bytes(env, adapter, tasks))
     program = _program(method, setting, fixed, layout, max(segments), keep_actions)
     lanes = split(layout.mesh, grid.lanes(layout, tasks, seed, numbers))
     params = replicate(layout.mesh, policy.params)
     per_round = adapter.episodes_per_round * grid.size
-    record, cpu = _run(program, lanes, params, segments, per_round)
-    per_lane = episodes + (len(segments) + 1) * setting.judged.episodes
+    journal = journal or Journal()
+    record, cpu = _run(program, lanes, params, segments, grid, layout, per_round, journal)
     # The search, too, begins with one evaluation of the initial choice.
     after = np.concatenate([[1], np.cumsum(segments) * adapter.episodes_per_round])
-    total = round(layout.num_lanes * per_lane / len(hypers))
-    return [
-        record.outcome(variant, grid, after, num_episodes=total, cpu_seconds=cpu / len(hypers))
-        for variant in range(len(hypers))
-    ]
+    per_lane = episodes + (len(segments) + 1) * setting.judged.episodes
+    num = len(hypers)
+    total = round(layout.num_lanes * per_lane / num)
+    return [record.outcome(i, grid, after, total, cpu / num) for i in range(num)]
 
 
 def _check_positive(**numbers: int) -> None:
@@ -215,6 +221,20 @@ def _check_positive(**numbers: int) -> None:
     for name, value in numbers.items():
         if value < 1:
             raise UsageError(f"{name} must be at least 1, found {value}")
+
+
+def _check_room(env: Environment, grid: Grid, episodes: int) -> None:
+    """Raise ``UsageError`` for an adaptation without tasks, or whose log does not fit into memory."""
+    if not grid.size:
+        raise UsageError("there are no tasks to adapt to")
+    a_step = 2 * 4 * env.spec.goal_dim + 4  # achieved goals and outcomes are most of what is kept
+    needed = grid.size * episodes * env.spec.horizon * a_step
+    room = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if needed > room:
+        raise UsageError(
+            f"{grid.size:,} adaptations of {episodes:,} episodes need {needed / 1e9:,.0f} GB of memory, "
+            f"this machine has {room / 1e9:.0f} GB; adapt with fewer --seeds, --episodes or tasks at once"
+        )
 
 
 def _segments(adapter: Adapter, episodes: int, eval_every: int) -> list[int]:
@@ -323,14 +343,14 @@ class Program:
     """A jitted function that is compiled once for each set of shapes, outside of any measured time."""
 
     def __init__(self, jitted: Any) -> None:
-        self._jitted = jitted
+        self.jitted = jitted
         self._compiled: dict[Any, Any] = {}
 
     def compile(self, *args: Any) -> Any:
         shapes, tree = jax.tree.flatten(jax.tree.map(jax.typeof, args))
         where = (tuple(shapes), tree)
         if where not in self._compiled:
-            self._compiled[where] = self._jitted.lower(*args).compile()
+            self._compiled[where] = self.jitted.lower(*args).compile()
         return self._compiled[where]
 
 
@@ -419,33 +439,108 @@ class Record(NamedTuple):
         )
 
 
+class Segment(NamedTuple):
+    """What a finished segment leaves behind, rows of lanes."""
+
+    log: AdaptLog
+    judged: Judged
+    cpu_seconds: float
+
+
 def _run(
-    programs: Programs, lanes: Lanes, params: Any, segments: Sequence[int], per_round: int
+    programs: Programs,
+    lanes: Lanes,
+    params: Any,
+    segments: Sequence[int],
+    grid: Grid,
+    layout: Layout,
+    per_round: int,
+    journal: Journal,
 ) -> tuple[Record, float]:
     """Run all segments of an adaptation, each followed by a judgement; the first judgement comes before.
 
-    ``per_round`` is the number of episodes that all lanes together run in a round. The second result is
-    the CPU time that it took, without compilation.
+    ``per_round`` is the number of episodes that all lanes together run in a round. Segments that the
+    journal holds are not run again. The second result is the CPU time, without compilation.
     """
     state = programs.start.compile(lanes, params)(lanes, params)
-    logs: list[AdaptLog] = []
-    judgements: list[Judged] = []
-    advance = programs.advance.compile((state, lanes), (params, jnp.int32(0), jnp.int32(0)))
-    cpu = time.process_time()
-    with tqdm(total=sum(segments) * per_round, unit="episode", disable=None) as progress:
-        for number, num_rounds in enumerate([0, *segments]):
-            shared = (params, jnp.int32(num_rounds), jnp.int32(number))
+    shared = (params, jnp.int32(0), jnp.int32(0))
+    advance = programs.advance.compile((state, lanes), shared)
+    shapes = jax.eval_shape(programs.advance.jitted, (state, lanes), shared)
+    done, state = _resumed(journal, grid, layout, state, shapes[1:])
+    rounds = [0, *segments]
+    before = sum(rounds[: len(done)])
+    with Progress(sum(rounds) * per_round, "episode", before * per_round) as progress:
+        for number in range(len(done), len(rounds)):
+            num = rounds[number]
+            cpu = time.process_time()
+            shared = (params, jnp.int32(num), jnp.int32(number))
             state, log, judged = advance((state, lanes), shared)
-            judgements.append(fetch(judged))
-            log = jax.tree.map(lambda rows, n=num_rounds: rows[:, :n], fetch(log))
-            progress.update(num_rounds * per_round)
-            if num_rounds:
-                logs.append(log)
-    cpu = time.process_time() - cpu
+            log, judged = fetch((log, judged))
+            cpu = time.process_time() - cpu
+            log = jax.tree.map(lambda rows, n=num: rows[: grid.size, :n], log)
+            judged = jax.tree.map(lambda rows: rows[: grid.size], judged)
+            _check_finite(log, judged, grid, before)
+            done.append(Segment(log, judged, cpu))
+            _keep(journal, number, done[-1], fetch(state), grid)
+            progress.update(num * per_round)
+            before += num
+    logs = [segment.log for segment in done[1:]]
     goals = [log.played.goals for log in logs]
     whole = jax.tree.map(lambda *rows: np.concatenate(rows, axis=1), *map(_without_goals, logs))
-    judged = jax.tree.map(lambda *rows: np.stack(rows, axis=-1), *judgements)
-    return Record(whole, judged, goals), cpu
+    judged = jax.tree.map(lambda *rows: np.stack(rows, axis=-1), *(s.judged for s in done))
+    return Record(whole, judged, goals), sum(segment.cpu_seconds for segment in done)
+
+
+def _check_finite(log: AdaptLog, judged: Judged, grid: Grid, rounds_before: int) -> None:
+    """Raise ``DataError`` for the first return that is not finite."""
+    searched, judging = np.isfinite(log.returns), np.isfinite(judged.return_)
+    if not searched.all():
+        lane, index, episode = np.argwhere(~searched)[0]
+        value, what = log.returns[lane, index, episode], f"round {rounds_before + index + 1}"
+    elif not judging.all():
+        lane = np.argmin(judging)
+        value, what = judged.return_[lane], "a judging episode"
+    else:
+        return
+    seed, task = divmod(int(lane) % (grid.seeds * grid.tasks), grid.tasks)
+    raise DataError(
+        f"the return of {what} on task {task} with seed number {seed} is {value}; the world or the policy "
+        "is broken"
+    )
+
+
+def _keep(journal: Journal, number: int, segment: Segment, state: Any, grid: Grid) -> None:
+    """Write a finished segment to the journal, and then the state that the next one starts from."""
+    if journal.folder is None:
+        return
+    journal.write(f"segment{number:04}", numbered_leaves(segment))
+    own = jax.tree.map(lambda rows: rows[: grid.size], state)
+    journal.write("state", {**numbered_leaves(own), "segments": np.array(number + 1)})
+
+
+def _resumed(
+    journal: Journal, grid: Grid, layout: Layout, state: Any, shapes: tuple[Any, Any]
+) -> tuple[list[Segment], Any]:
+    """The finished segments in a journal and the state after them; none, and the first state, if any of
+    them is missing."""
+    saved = journal.read("state")
+    if saved is None:
+        return [], state
+    records = [journal.read(f"segment{i:04}") for i in range(int(saved.pop("segments")))]
+    like = Segment(*jax.tree.map(lambda leaf: 0, shapes), cpu_seconds=0.0)
+    done = [with_leaves(like, record) for record in records if record is not None]
+    if len(done) < len(records):
+        return [], state
+    index = (
+        np.arange(layout.num_lanes) % grid.size
+    )  # the lanes beyond the grid repeat the first ones
+
+    def placed(rows: Any, like: Any) -> Any:
+        rows = jnp.asarray(rows[index])
+        return jax.random.wrap_key_data(rows) if is_key(like) else rows
+
+    state = split(layout.mesh, jax.tree.map(placed, with_leaves(state, saved), state))
+    return [s._replace(cpu_seconds=float(s.cpu_seconds)) for s in done], state
 
 
 def _without_goals(log: AdaptLog) -> AdaptLog:
@@ -480,6 +575,9 @@ def evaluate(
     """Mean returns ``[S, N]`` of queries with leaves ``[S, N, ..]``, one for each seed and task.
 
     The second result is how many episodes a broken world ended.
+
+    Raises:
+      DataError: if the policy was made for another world, or a return is not finite.
     """
     check_fits(policy.config, env.spec)
     seeds, num = queries.prompt.mask.shape[:2]
@@ -494,6 +592,8 @@ def evaluate(
     run = _measurement(env, policy.config, layout, episodes)
     found = fetch(run(split(layout.mesh, own), replicate(layout.mesh, policy.params)))
     found = jax.tree.map(lambda rows: grid.shape(rows)[0], found)
+    if not np.isfinite(found.return_).all():
+        raise DataError("a return is not finite; the world or the policy is broken")
     return found.return_, int(found.num_failed.sum())
 
 

@@ -8,7 +8,7 @@ from a checkpoint equals one that was never interrupted, bit for bit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -19,12 +19,12 @@ import optax
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh
 from jaxtyping import Array, Float, Key, PRNGKeyArray
-from tqdm import tqdm
 
 from envs.base import EnvSpec, Trajectory
-from envs.errors import UsageError
+from envs.errors import DataError, UsageError
 from mgpo_jax.dataset import BatchPlan, Dataset, check_dataset, plan_batches
 from mgpo_jax.policy import LoadedPolicy
+from mgpo_jax.progress import Progress
 from mgpo_jax.prompts import hindsight_outcome, sample_prompt, single_goal
 from mgpo_jax.settings import RECIPE_NETWORK, TrainConfig, check_settings
 from mgpo_jax.sharding import (
@@ -39,6 +39,7 @@ from mgpo_jax.sharding import (
 )
 from mgpo_jax.transformer import GoalTransformer, TransformerConfig, network_config
 
+FINITE = "weights_finite"  # a flag among the metrics of a step, which is no figure
 HIT = 0.1  # per-dimension tolerance for counting a predicted action as correct
 # Root mean square of a typical AdamW update before the learning rate.
 ADAMW_RMS = 0.2
@@ -246,7 +247,9 @@ def _make_update(
             "grad_norm": optax.tree.norm(grads),
             "num_steps": stats.num_steps,
         }
-        return unravel(optax.apply_updates(weights, updates)), opt_state, metrics
+        weights = optax.apply_updates(weights, updates)
+        metrics[FINITE] = jnp.isfinite(weights).all()
+        return unravel(weights), opt_state, metrics
 
     return update
 
@@ -331,6 +334,29 @@ class Trainer:
         return {"loss": total.nll / total.num_steps, "accuracy": total.correct / total.num_steps}
 
 
+def finite_metrics(step: int, metrics: Mapping[str, Any]) -> dict[str, Any]:
+    """The figures of a gradient step, numpy scalars.
+
+    Raises:
+      DataError: if one of them, or a weight after the step, is not finite.
+    """
+    figures = {name: np.asarray(value) for name, value in fetch(dict(metrics)).items()}
+    weights_finite = bool(figures.pop(FINITE, True))
+    for name, value in figures.items():
+        if not np.isfinite(value):
+            raise diverged(step, f"train/{name}", value)
+    if not weights_finite:
+        raise diverged(step, "weights", "NaN or infinity")
+    return figures
+
+
+def diverged(step: int, metric: str, value: Any) -> DataError:
+    return DataError(
+        f"training stopped at step {step}: {metric} became {value}; use a lower --learning-rate or "
+        "a lower --clip-norm"
+    )
+
+
 def batch_stream(
     config: TrainConfig, dataset: Dataset, truncate: bool, num_devices: int = 1, first_step: int = 0
 ) -> Iterator[list[BatchPlan]]:
@@ -367,7 +393,7 @@ def pretrain(
         recipe's (``settings.RECIPE_NETWORK``: no dropout and four heads).
 
     Raises:
-      DataError: if the dataset does not fit the world.
+      DataError: if the dataset does not fit the world, or a loss or weight is not finite any more.
       UsageError: if a setting is out of its bounds.
     """
     config = config or TrainConfig()
@@ -377,6 +403,12 @@ def pretrain(
     trainer = Trainer(config, sizes, dataset, mesh)
     state = trainer.init()
     batches = batch_stream(config, dataset, spec.truncate_in_hindsight, mesh.devices.size)
-    for _ in tqdm(range(config.steps), unit="step", disable=None):
-        state, _ = trainer.step(state, next(batches))
+    before: dict[str, Any] = {}
+    with Progress(config.steps, "step") as progress:
+        while state.step < config.steps:
+            state, metrics = trainer.step(state, next(batches))
+            finite_metrics(state.step - 1, before)  # computed by now, so nothing waits for it
+            before = metrics
+            progress.update()
+    finite_metrics(state.step, before)
     return LoadedPolicy(sizes, state.params, {"steps": config.steps})

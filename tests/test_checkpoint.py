@@ -12,12 +12,19 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import orbax.checkpoint as ocp
 import pytest
 from jax.flatten_util import ravel_pytree
 
 import envs
 from envs.errors import DataError
-from mgpo_jax.checkpoint import checkpoints, restore_state, save_state
+from mgpo_jax.checkpoint import (
+    Snapshot,
+    _named_leaves,
+    checkpoints,
+    restore_state,
+    save_state,
+)
 from mgpo_jax.prompts import single_goal
 from mgpo_jax.settings import TrainConfig
 from mgpo_jax.training import TrainState, make_optimizer
@@ -45,23 +52,101 @@ def train_state(params: dict, step: int) -> TrainState:
     return TrainState(*filled, step)
 
 
+ROW = {"step": 3, "train/loss": 0.1}
+PENDING = {"loss": float(np.float32(0.3))}
+
+
+def snapshot(params: dict, step: int) -> Snapshot:
+    return Snapshot(train_state(params, step), [ROW], [PENDING])
+
+
 def test_state_comes_back(tmp_path: Path, params: dict) -> None:
     blank = train_state(params, 0)
     with checkpoints(tmp_path) as manager:
         assert restore_state(manager, blank) is None
         for step in (3, 7):
-            save_state(manager, train_state(params, step))
+            save_state(manager, snapshot(params, step))
     with checkpoints(tmp_path) as manager:
-        state = restore_state(manager, blank)
-    assert state is not None
-    assert state.step == 7
-    assert jax.tree.structure(state) == jax.tree.structure(blank)
-    jax.tree.map(np.testing.assert_array_equal, state, train_state(params, 7))
+        found = restore_state(manager, blank)
+    assert found is not None
+    assert (found.state.step, found.measured, found.pending) == (7, [ROW], [PENDING])
+    assert jax.tree.structure(found.state) == jax.tree.structure(blank)
+    jax.tree.map(np.testing.assert_array_equal, found.state, train_state(params, 7))
+
+
+def test_checkpoint_of_another_run(tmp_path: Path, params: dict) -> None:
+    blank = train_state(params, 0)
+    with checkpoints(tmp_path) as manager:
+        save_state(manager, snapshot(params, 3), "aa" * 32)
+        assert restore_state(manager, blank, "aa" * 32) is not None
+        with pytest.raises(DataError, match="of a run with other settings or data; remove"):
+            restore_state(manager, blank, "bb" * 32)
+
+
+def test_a_checkpoint_without_hash_is_read(tmp_path: Path, params: dict) -> None:
+    """Those of older versions hold the leaves alone."""
+    with checkpoints(tmp_path) as manager:
+        manager.save(5, args=ocp.args.StandardSave(_named_leaves(train_state(params, 5))))
+        found = restore_state(manager, train_state(params, 0), "aa" * 32)
+    assert found is not None
+    assert (found.state.step, found.measured, found.pending) == (5, [], [])
+
+
+def damage(checkpoint: Path, how: str) -> None:
+    """Flip a bit of the largest file, or cut or remove it."""
+    largest = max((p for p in checkpoint.rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
+    content = bytearray(largest.read_bytes())
+    content[len(content) // 2] ^= 1
+    if how == "missing":
+        largest.unlink()
+    else:
+        largest.write_bytes(content if how == "flipped" else content[: len(content) // 2])
+
+
+@pytest.mark.parametrize("how", ["flipped", "cut", "missing"])
+def test_a_damaged_checkpoint_is_set_aside(
+    tmp_path: Path, params: dict, how: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The run goes on from the one before, and saves the step of the damaged one again."""
+    folder, blank = tmp_path / "checkpoints", train_state(params, 0)
+    with checkpoints(folder) as manager:
+        for step in (3, 7):
+            save_state(manager, snapshot(params, step))
+    damage(folder / "7", how)
+    with checkpoints(folder) as manager:
+        found = restore_state(manager, blank)
+        assert found is not None
+        assert found.state.step == 3
+        save_state(manager, snapshot(params, 7))
+    assert (tmp_path / "checkpoints-damaged/7").is_dir()
+    err = capfd.readouterr().err
+    assert f"checkpoint {folder / '7'} is damaged; it was moved to" in err
+    assert "Traceback" not in err
+    with checkpoints(folder) as manager:
+        again = restore_state(manager, blank)
+    assert again is not None
+    assert again.state.step == 7
+
+
+def test_no_sound_checkpoint_is_left(tmp_path: Path, params: dict) -> None:
+    folder = tmp_path / "checkpoints"
+    with checkpoints(folder) as manager:
+        save_state(manager, snapshot(params, 3))
+    damage(folder / "3", "cut")
+    with checkpoints(folder) as manager:
+        assert restore_state(manager, train_state(params, 0)) is None
+
+
+def test_a_file_in_the_place_of_checkpoints(tmp_path: Path) -> None:
+    (tmp_path / "checkpoints").write_text("")
+    refused = pytest.raises(DataError, match="is no folder; remove it")
+    with refused, checkpoints(tmp_path / "checkpoints"):
+        pass
 
 
 def test_state_of_another_network(tmp_path: Path, params: dict) -> None:
     with checkpoints(tmp_path) as manager:
-        save_state(manager, train_state(params, 1))
+        save_state(manager, snapshot(params, 1))
     other = params_of(network_config(SPEC, embed_dim=16, num_layers=1))
     with checkpoints(tmp_path) as manager, pytest.raises(DataError, match="of another network"):
         restore_state(manager, train_state(other, 0))
@@ -69,12 +154,13 @@ def test_state_of_another_network(tmp_path: Path, params: dict) -> None:
 
 SAVER = """
 import sys, itertools, jax.numpy as jnp
-from mgpo_jax.checkpoint import checkpoints, save_state
+from mgpo_jax.checkpoint import Snapshot, checkpoints, save_state
 from mgpo_jax.training import TrainState
 with checkpoints(sys.argv[1]) as manager:
     for step in itertools.count(1):
         leaf = jnp.full((400, 400), step, jnp.float32)
-        save_state(manager, TrainState({"a": leaf, "b": leaf}, (leaf,), step))
+        state = TrainState({"a": leaf, "b": leaf}, (leaf,), step)
+        save_state(manager, Snapshot(state, [], []))
         print(step, flush=True)
 """
 
@@ -96,8 +182,9 @@ def test_kill_in_mid_save_loses_nothing(tmp_path: Path) -> None:
     process.wait()
     blank = jnp.zeros((400, 400))
     with checkpoints(tmp_path) as manager:
-        state = restore_state(manager, TrainState({"a": blank, "b": blank}, (blank,), 0))
-    assert state is not None
-    assert state.step >= 4  # saves run in the background, at most one behind
+        found = restore_state(manager, TrainState({"a": blank, "b": blank}, (blank,), 0))
+    assert found is not None
+    state = found.state
+    assert state.step >= 6
     for leaf in jax.tree.leaves((state.params, state.opt_state)):
         np.testing.assert_array_equal(leaf, state.step)

@@ -6,6 +6,7 @@ import importlib
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -15,14 +16,15 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-import tyro
 
 import envs
 from envs.registry import WORLDS
 from experiments import pretrain, runtime, training
 from experiments.__main__ import COMMANDS
+from experiments.parsing import parse
 from experiments.store.settings import PretrainConfig, pretrain_default, pretrain_preset
 from mgpo_jax import methods
 from mgpo_jax.dataset import load_dataset
@@ -36,6 +38,7 @@ from mgpo_jax.tasks import (
     save_tasks,
     task_hashes,
 )
+from mgpo_jax.training import Trainer
 
 ROOT = Path(__file__).parents[1]
 Run = Callable[..., tuple[int, str]]
@@ -78,10 +81,7 @@ def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def tyro_config(line: str) -> PretrainConfig:
-    words = line.split()[1:]
-    return tyro.cli(
-        tyro.conf.OmitArgPrefixes[PretrainConfig], args=words, default=pretrain_default(words)
-    )
+    return parse(PretrainConfig, line.split()[1:], pretrain_default)
 
 
 @pytest.fixture
@@ -130,9 +130,9 @@ RESULT = Path(__file__).parents[1] / "results/maze15/ucb"
         ("collect --policy astr4", 2, "did you mean 'astar4'"),
         ("collect --episodes 0", 2, "--trajectories must be at least 1"),
         ("evaluate", 2, "no result folder given"),
-        (f"evaluate {RESULT} --obs-noise -1", 2, "noise must be finite and not negative"),
-        (f"evaluate {RESULT} --obs-noise nan", 2, "noise must be finite and not negative"),
-        (f"evaluate {RESULT} --action-noise 0.1 -1", 2, "noise must be finite and not negative"),
+        (f"evaluate {RESULT} --obs-noise -1", 2, "--obs-noise must be at least 0"),
+        (f"evaluate {RESULT} --obs-noise nan", 2, "--obs-noise must be a finite number"),
+        (f"evaluate {RESULT} --action-noise 0.1 -1", 2, "--action-noise must be at least 0"),
         ("evaluate nowhere", 1, "no result folder nowhere"),
         ("pretrain --obs-noise -1", 2, "--obs-noise must be at least 0"),
         ("pretrain --obs-noise nan", 2, "--obs-noise must be a finite number"),
@@ -311,18 +311,18 @@ def test_resumed_run_equals_an_uninterrupted_one(
     """Ctrl-C after step 4 saves and exits with 130; --resume then ends in the same bits."""
 
     @contextmanager
-    def ctrl_c_after_four_steps() -> Iterator[Callable[[], bool]]:
-        asked = iter([False] * 6 + [True] * 9)  # two questions a step
+    def ctrl_c_after_four_steps() -> Iterator[Callable[[], int]]:
+        asked = iter([0, 0, 0, signal.SIGINT])  # one question a step
         yield lambda: next(asked)
 
     line = f"{TINY} --out second"
     with monkeypatch.context() as patch:
-        patch.setattr(training, "stop_request", ctrl_c_after_four_steps)
+        patch.setattr(training, "asked_to_stop", ctrl_c_after_four_steps)
         code, text = command(line)
     assert code == 130
-    assert "stopped at step 4; continue with --resume" in text
+    assert "stopped at step 4 of 6; continue with --resume" in text
     assert not Path("second/policy").exists()
-    code, text = command(f"{line} --resume")
+    code, text = command(line.replace("--save-every 2", "--save-every 5") + " --resume")
     assert code == 0, text
     assert "resuming second at step 4" in text
     jax.tree.map(np.testing.assert_array_equal, weights(Path("second")), weights(RUN))
@@ -330,10 +330,105 @@ def test_resumed_run_equals_an_uninterrupted_one(
         [json.loads(row) for row in (run / "metrics.jsonl").read_text().splitlines()]
         for run in (RUN, Path("second"))
     ]
-    assert [row["step"] for row in rows[0]] == [row["step"] for row in rows[1]] == [3, 6]
-    for name in ("train/loss", "val/loss", "eval/initial_return"):
-        assert rows[0][0][name] == rows[1][0][name]
-    assert rows[0][1]["val/loss"] == rows[1][1]["val/loss"]
+    for row in (*rows[0], *rows[1]):
+        assert row.pop("cpu_seconds_per_step") > 0
+    assert rows[0] == rows[1]
+    assert [row["step"] for row in rows[0]] == [3, 6]
+    assert command(f"{line} --resume")[0] == 0  # a finished run has nothing left to do
+
+
+def test_a_moved_run_goes_on(command: Run, workspace: Path) -> None:
+    """Its place, loggers and the cadence of evaluations are no settings of a training."""
+    shutil.move(RUN, "elsewhere")
+    shutil.rmtree("elsewhere/policy")
+    line = TINY.replace("--eval-every 3", "--eval-every 2")
+    code, text = command(f"{line} --resume --out {Path('elsewhere').absolute()}")
+    assert code == 0, text
+    assert (workspace / "elsewhere/policy/weights.npz").is_file()
+
+
+def test_training_on_another_dataset_is_refused(command: Run, workspace: Path) -> None:
+    data = workspace / "data/maze15/astar4-40-seed0"
+    shutil.rmtree(data)
+    assert command("collect --episodes 40 --seed 5")[0] == 0
+    shutil.move(workspace / "data/maze15/astar4-40-seed5", data)
+    manifest = json.loads((data / "manifest.json").read_text())
+    (data / "manifest.json").write_text(json.dumps({**manifest, "seed": 0}))
+    code, text = command(f"{TINY} --resume")
+    assert code == 1
+    assert "which now has" in text
+    assert "collect it again as it was, or start a new run with --out" in text
+
+
+@pytest.mark.parametrize("line", ["", "--resume"])
+def test_a_folder_in_which_no_run_has_begun_is_started_in(
+    command: Run, workspace: Path, line: str
+) -> None:
+    """What a kill at the very start leaves, in this version and in older ones."""
+    fresh = Path("fresh")
+    fresh.mkdir()
+    for name in (".lock", "meta.json", "config.json.partial", ".writing-00ff.json"):
+        (fresh / name).write_text("")
+    code, text = command(f"{TINY} --out fresh {line}")
+    assert code == 0, text
+    left = {path.name for path in fresh.iterdir()} - {path.name for path in RUN.iterdir()}
+    assert left == {"config.json.partial"}
+
+
+def test_a_folder_with_other_files_is_left_alone(command: Run, workspace: Path) -> None:
+    Path("mine").mkdir()
+    Path("mine/thesis.tex").write_text("")
+    code, text = command(f"{TINY} --out mine --resume")
+    assert (code, "mine exists already and is no training run" in text) == (2, True)
+    assert [path.name for path in Path("mine").iterdir()] == ["thesis.tex"]
+
+
+def test_a_run_without_meta_goes_on(command: Run, workspace: Path) -> None:
+    (workspace / RUN / "meta.json").unlink()
+    assert command(f"{TINY} --resume")[0] == 0
+    assert "dataset_sha256" in json.loads((workspace / RUN / "meta.json").read_text())
+
+
+def test_a_torn_row_of_metrics_is_made_good(command: Run, workspace: Path) -> None:
+    """The rows are in the checkpoint as well."""
+    path = workspace / RUN / "metrics.jsonl"
+    whole = path.read_text()
+    path.write_text(whole[:-40] + "\0\0")
+    assert command(f"{TINY} --resume")[0] == 0
+    assert path.read_text() == whole
+
+
+def test_a_loss_that_is_not_finite_stops_the_training(
+    command: Run, workspace: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The last sound checkpoint stays, and there is no policy."""
+    step = Trainer.step
+
+    def broken(self: Trainer, state: Any, plans: Any) -> Any:
+        state, metrics = step(self, state, plans)
+        if state.step == 5:
+            metrics = {**metrics, "loss": jnp.float32(jnp.nan)}
+        return state, metrics
+
+    monkeypatch.setattr(Trainer, "step", broken)
+    code, text = command(f"{TINY} --out broken")
+    assert code == 1
+    assert "training stopped at step 5: train/loss became nan; use a lower" in text
+    assert not Path("broken/policy").exists()
+    assert {path.name for path in Path("broken/checkpoints").iterdir()} == {"2", "4"}
+    rows = Path("broken/metrics.jsonl").read_text()
+    assert [json.loads(row)["step"] for row in rows.splitlines()] == [3]
+
+
+def test_weights_that_are_not_finite_stop_the_training(command: Run, workspace: Path) -> None:
+    line = TINY.replace("--steps 6", "--steps 60").replace("--eval-every 3", "--eval-every 60")
+    code, text = command(
+        f"{line} --out broken --learning-rate 100 --warmup-steps 0 --weight-decay 1000 "
+        "--optimizer adamw --schedule constant"
+    )
+    assert code == 1
+    assert "training stopped at step" in text
+    assert not Path("broken/policy").exists()
 
 
 def test_resume_refuses_other_settings(command: Run, workspace: Path) -> None:
@@ -341,12 +436,6 @@ def test_resume_refuses_other_settings(command: Run, workspace: Path) -> None:
     assert code == 2
     assert "started with other settings" in text
     assert "0.5" in text
-
-
-def test_resume_without_a_run(command: Run, workspace: Path) -> None:
-    code, text = command(f"{TINY} --resume --out nothing")
-    assert code == 2
-    assert "no run to resume" in text
 
 
 def test_adapt_writes_what_it_prints(
@@ -451,12 +540,12 @@ def walled_in(tasks: Any) -> np.ndarray:
     ("change", "says"),
     [
         (lambda t: {"goal": None}, "lacks goal"),
-        (lambda t: {"maze": t.maze[:, :13]}, "shape [N, 15, 15]"),
+        (lambda t: {"maze": t.maze[:, :13]}, "maze has shape [2, 13, 15], wanted [task 2, 15, 15]"),
         (lambda t: {"maze": t.maze * 2}, "0 (free) and 1 (wall) only"),
         (lambda t: {"goal": t.goal * 0}, "is not a free cell"),
         (lambda t: {"goal": np.full_like(t.goal, 99)}, "is not a free cell"),
         (lambda t: {"goal": t.goal + 0.5}, "integers"),
-        (lambda t: {"goal": t.goal[:1]}, "shape [2, 2]"),
+        (lambda t: {"goal": t.goal[:1]}, "goal has shape [1, 2], wanted [task 2, 2]"),
         (lambda t: {"maze": walled_in(t)}, "no free path leads from the start"),
         (lambda t: {"maze": t.maze * np.nan}, "maze must hold integers, found float64"),
     ],
@@ -485,7 +574,7 @@ def test_task_file_that_is_missing_or_no_npz(command: Run, workspace: Path) -> N
 def test_task_file_of_single_numbers(command: Run, workspace: Path) -> None:
     np.savez("bad.npz", maze=1, goal=2)
     code, text = command(f"adapt --policy {POLICY} --tasks bad.npz")
-    assert (code, "bad.npz holds no tasks" in text) == (1, True), text
+    assert (code, "bad.npz: maze has shape [], wanted [task 1 to" in text) == (1, True), text
 
 
 def test_tasks_survive_the_file(tmp_path: Path) -> None:
@@ -499,7 +588,7 @@ def test_presets_differ_as_they_say() -> None:
     paper = pretrain_preset("maze15", "paper")
     assert (paper.train.steps, paper.train.learning_rate, paper.dropout) == (50_000, 1e-4, 0.1)
     assert (paper.data.trajectories, paper.prompt_order) == (10_000, False)
-    assert replace(pretrain_default([]), preset="fast") == pretrain_preset("maze15", "fast")
+    assert parse(PretrainConfig, [], pretrain_default) == pretrain_preset("maze15", "fast")
 
 
 def test_release_packs_a_run_with_its_card(command: Run, workspace: Path) -> None:

@@ -15,6 +15,7 @@ from envs import episodes
 from envs.errors import DataError, UsageError
 from experiments import ablations
 from experiments.reproduce import main
+from experiments.store import settings as store_settings
 from experiments.store.results import load_results
 from experiments.store.settings import PretrainConfig, ReproduceConfig, pretrain_preset
 from mgpo_jax.settings import check_settings
@@ -35,7 +36,8 @@ def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Trainings of two steps and adaptations of two episodes to two tasks."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("MGPO_DATA", raising=False)
-    monkeypatch.setattr(ablations, "pretrain_preset", tiny_preset)
+    for module in (ablations, store_settings):
+        monkeypatch.setattr(module, "pretrain_preset", tiny_preset)
     monkeypatch.setattr(ablations, "EPISODES", 2)
     monkeypatch.setattr(episodes, "MAX_SEGMENTS", 1)
     few = lambda world: jax.tree.map(lambda leaf: leaf[:2], released_tasks(world))  # noqa: E731

@@ -24,7 +24,7 @@ from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.prompts import Prompt, single_goal
 from mgpo_jax.rollout import Query
 from mgpo_jax.runner import _lay_out, adapt, cache_bytes, evaluate, lanes_together, play, sweep
-from mgpo_jax.settings import number
+from mgpo_jax.settings import NotNegative
 from mgpo_jax.tasks import sample_tasks, task_at
 from mgpo_jax.transformer import GoalTransformer, network_config
 
@@ -373,7 +373,7 @@ def test_the_episodes_that_judge_are_those_of_play(tasks):
 
 @dataclass(frozen=True)
 class LearnerHyper(NoHyper):
-    rate: float = number(0.5, at_least=0)
+    rate: NotNegative = 0.5
     label: str = ""
 
 

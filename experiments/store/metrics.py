@@ -4,40 +4,78 @@ from __future__ import annotations
 
 import importlib
 import json
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import AllowInfNan, Strict
 
 from envs.errors import DataError, UsageError
 from experiments.store.settings import PretrainConfig
-from mgpo_jax.files import to_json
+from mgpo_jax.files import to_json, write_text
+from mgpo_jax.schema import read_json_lines
 
 METRICS = "metrics.jsonl"
 
 
-def read_metrics(path: Path) -> list[dict[str, Any]]:
+RESUME = "resume the run with `python -m experiments.pretrain --resume` and its other flags"
+
+
+def read_metrics(path: Path, names: Collection[str] = ()) -> list[dict[str, Any]]:
     """The rows of a ``metrics.jsonl``.
 
+    Args:
+      path: the file.
+      names: metrics that the last row must have.
+
     Raises:
-      DataError: if it is missing, or a line is no JSON object with a step.
+      DataError: if it is missing or has no rows, a line is no JSON object of numbers with a later step than
+        the one before, or the last row lacks a metric.
     """
-    try:
-        rows = [json.loads(line) for line in path.read_text().splitlines()]
-        assert all(isinstance(row["step"], int) for row in rows)
-    except (AssertionError, KeyError, OSError, TypeError, ValueError):
-        raise DataError(f"{path} is missing or not readable JSON lines") from None
+    rows = read_json_lines(path, dict[str, Annotated[float, AllowInfNan(False), Strict()]], RESUME)
+    if not rows:
+        raise DataError(f"{path} has no rows; {RESUME}")
+    last = 0
+    for number, row in enumerate(rows, 1):
+        step = row.get("step", 0)
+        if step <= last or not step.is_integer():
+            found = f"found {step:g}" if "step" in row else "found none"
+            raise DataError(
+                f"{path}, line {number}: step must be an integer above {last}, {found}; {RESUME}"
+            )
+        row["step"] = last = int(step)
+    if missing := [name for name in names if name not in rows[-1]]:
+        raise DataError(f"{path}, line {len(rows)} lacks {', '.join(missing)}; {RESUME}")
     return rows
 
 
-class Metrics:
-    """Appends rows to ``metrics.jsonl`` and, if asked, to TensorBoard and Weights & Biases."""
+LOGGERS = {"tb": "tensorboardX", "wandb": "wandb"}  # by setting, the package that it needs
 
-    def __init__(self, folder: Path, config: PretrainConfig, first_step: int) -> None:
+
+def check_loggers(config: PretrainConfig) -> None:
+    """Raise ``UsageError`` for a logger that is asked for and not installed."""
+    for setting, module in LOGGERS.items():
+        if getattr(config, setting):
+            _optional(module, setting)
+
+
+class Metrics:
+    """Appends rows to ``metrics.jsonl`` and, if asked, to TensorBoard and Weights & Biases.
+
+    Args:
+      folder: the run folder.
+      config: settings of the run.
+      rows: what was measured before, as the checkpoint tells that the run goes on from; the file then
+        holds these rows and no others.
+    """
+
+    def __init__(
+        self, folder: Path, config: PretrainConfig, rows: Sequence[Mapping[str, float]]
+    ) -> None:
         self.path = folder / METRICS
-        rows = read_metrics(self.path) if self.path.exists() else []
-        # A resumed run writes again what came after its checkpoint.
-        kept = [json.dumps(row) for row in rows if row["step"] <= first_step]
-        self.path.write_text("".join(row + "\n" for row in kept))
+        write_text(self.path, "".join(map(_line, rows)))
+        self.rows = [dict(row) for row in rows]
         self.writers: list[Callable[[dict[str, float], int], Any]] = []
         if config.tb:
             board = _optional("tensorboardX", "tb").SummaryWriter(str(folder / "tensorboard"))
@@ -50,10 +88,18 @@ class Metrics:
             self.writers.append(lambda row, step: wandb.log(row, step=step))
 
     def write(self, step: int, row: dict[str, float]) -> None:
-        with open(self.path, "a") as file:
-            file.write(json.dumps({"step": step, **row}) + "\n")
+        """Append a row, which is on disk when this returns."""
+        self.rows.append({"step": step, **row})
+        with open(self.path, "a", encoding="utf-8") as file:
+            file.write(_line(self.rows[-1]))
+            file.flush()
+            os.fsync(file.fileno())
         for writer in self.writers:
             writer(row, step)
+
+
+def _line(row: Mapping[str, float]) -> str:
+    return json.dumps(row, allow_nan=False) + "\n"
 
 
 def _optional(module: str, extra: str) -> Any:

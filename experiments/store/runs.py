@@ -1,0 +1,125 @@
+"""The folder of a pre-training run: when it may be started in, and what a resumed run must agree on.
+
+It holds ``config.json`` (the settings, written last of what a start writes, so that a run has begun where
+it is there), ``meta.json`` (how and with what it was made), ``metrics.jsonl``, ``checkpoints`` and, when it
+is finished, ``policy`` and ``training.png``. Nothing here imports jax.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+from envs.errors import DataError, UsageError, shown
+from experiments.store.settings import PretrainConfig, saved_pretraining, training_settings
+from mgpo_jax.claims import LOCK, check_place
+from mgpo_jax.files import TEMPORARY, write_json
+from mgpo_jax.schema import read_document
+
+CONFIG, META, CHECKPOINTS, POLICY = "config.json", "meta.json", "checkpoints", "policy"
+ROOM = (
+    32 << 20
+)  # bytes that must be free before a training starts: a few checkpoints of a small network
+
+
+def has_begun(folder: Path) -> bool:
+    """Whether a folder holds a run; one that was killed before it began is no run."""
+    return os.path.isfile(folder / CONFIG)
+
+
+def is_finished(folder: Path) -> bool:
+    """Whether a run has trained to its end and written its policy."""
+    return all((folder / POLICY / name).is_file() for name in ("config.json", "weights.npz"))
+
+
+def check_start(config: PretrainConfig) -> None:
+    """Raise ``UsageError`` where a run cannot be started, or is there already."""
+    folder = config.folder
+    if has_begun(folder):
+        if not config.resume:
+            raise UsageError(
+                f"{folder} exists already; continue it with --resume, or choose another with --out"
+            )
+        if (folder / CHECKPOINTS).exists() and not (folder / CHECKPOINTS).is_dir():
+            raise DataError(
+                f"{folder / CHECKPOINTS} is no folder; remove it to train from the first step"
+            )
+    elif os.path.lexists(folder) and not _holds_nothing(folder):
+        raise UsageError(
+            f"{folder} exists already and is no training run; choose another with --out"
+        )
+    check_place(folder, num_bytes=ROOM)
+
+
+def _holds_nothing(folder: Path) -> bool:
+    """Whether a folder has only what a run leaves that was killed before it began."""
+    own = (LOCK, META, f"{CONFIG}.partial")
+    return folder.is_dir() and all(
+        path.name in own or path.name.startswith(TEMPORARY) for path in folder.iterdir()
+    )
+
+
+def identity(config: PretrainConfig, dataset_sha256: str) -> str:
+    """A hash of everything that decides about the weights of a run, but for the machine."""
+    text = json.dumps([training_settings(config), dataset_sha256], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def begin(config: PretrainConfig, meta: dict[str, Any]) -> None:
+    """Note what a new run is."""
+    write_json(config.folder / META, meta)
+    write_json(config.folder / CONFIG, config)
+
+
+def check_same(config: PretrainConfig, meta: dict[str, Any]) -> None:
+    """Check that a run which is resumed ends as it would have without a stop.
+
+    A line on stderr says so where only the last bits of the result may differ.
+
+    Raises:
+      UsageError: if it was started with other settings.
+      DataError: if it was started on another dataset.
+    """
+    folder = config.folder
+    before = training_settings(saved_pretraining(folder / CONFIG))
+    now = training_settings(config)
+    changed = [f"{k} {shown(before[k])} -> {shown(now[k])}" for k in now if now[k] != before[k]]
+    if changed:
+        raise UsageError(
+            f"{folder} was started with other settings: {'; '.join(changed)}; give the same ones, or start "
+            "a new run with --out"
+        )
+    if not (folder / META).is_file():
+        write_json(folder / META, meta)
+        return
+    saved = read_document(
+        folder / META, dict[str, Any], f"remove {folder / META}, and it is written again"
+    )
+    hash_before, hash_now = saved.get("dataset_sha256"), meta["dataset_sha256"]
+    if hash_before not in (None, hash_now):
+        raise DataError(
+            f"{folder} was trained on {meta['dataset']} with the hash {shown(hash_before)[:13]}.., which "
+            f"now has {hash_now[:12]}..; collect it again as it was, or start a new run with --out"
+        )
+    say_what_differs(saved, meta, str(folder))
+
+
+def say_what_differs(saved: dict[str, Any], now: dict[str, Any], what: str) -> None:
+    """A line on stderr if what goes on was begun with other devices or versions."""
+    differs = []
+    if isinstance(saved.get("devices"), list) and len(saved["devices"]) != len(now["devices"]):
+        differs.append(f"{len(saved['devices'])} devices (now {len(now['devices'])})")
+    if isinstance(saved.get("versions"), dict):
+        versions = now["versions"]
+        differs += [
+            f"{name} {shown(old)} (now {versions.get(name)})"
+            for name, old in saved["versions"].items()
+            if versions.get(name) != old
+        ]
+    if differs:
+        text = f"{what} was begun with {', '.join(differs)}: the result may differ in its last bits"
+        print(text, file=sys.stderr)

@@ -1,0 +1,87 @@
+"""Long work towards a new folder: what is finished is kept, and a killed command goes on with ``--resume``.
+
+While ``NAME`` is being made there is a folder ``NAME.partial`` with the finished pieces, which only one
+process may work in.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from envs.errors import UsageError, shown
+from experiments.signals import farewell
+from experiments.store.runs import say_what_differs
+from mgpo_jax.files import has_work, new_folder, partial_name, to_json, write_json
+from mgpo_jax.journal import Journal
+from mgpo_jax.schema import read_document
+
+PIECES = "progress"
+SETTINGS = "settings.json"
+
+
+@contextmanager
+def long_work(
+    folder: Path,
+    settings: Mapping[str, Any],
+    meta: Mapping[str, Any],
+    resume: bool,
+    wait: bool = False,
+) -> Iterator[tuple[Path, Journal]]:
+    """A place to write the result to, and a journal of finished pieces.
+
+    Args:
+      folder: what the place becomes when the block ends.
+      settings: everything that decides about the result.
+      meta: how and with what this process works, of ``provenance``.
+      resume: whether to go on with what a stopped process has finished.
+      wait: wait for another process that makes the same folder.
+
+    Raises:
+      DataError: if ``folder`` exists, or another process makes it.
+      UsageError: if there is unfinished work that ``resume`` does not ask for, or it is of other settings.
+    """
+    pieces = partial_name(folder) / PIECES
+    with new_folder(folder, keep=PIECES, wait=wait) as place:
+        if has_work(pieces):
+            if not resume:
+                raise UsageError(
+                    f"{pieces.parent} holds unfinished work; continue it with --resume, or remove it"
+                )
+            _check_same(pieces, settings, meta)
+            print(f"going on with the unfinished work in {pieces.parent}", file=sys.stderr)
+        journal = Journal(pieces)
+        write_json(pieces / SETTINGS, {"settings": settings, "meta": meta})
+        with farewell(lambda: _farewell(pieces)):
+            yield place, journal
+
+
+def _check_same(pieces: Path, settings: Mapping[str, Any], meta: Mapping[str, Any]) -> None:
+    """Raise ``UsageError`` if unfinished work was begun with other settings."""
+    saved = read_document(
+        pieces / SETTINGS, dict[str, Any], f"remove {pieces.parent} and start again"
+    )
+    before, now = saved.get("settings"), to_json(settings)
+    if not isinstance(before, dict):
+        raise UsageError(f"{pieces / SETTINGS} lacks settings; remove {pieces.parent}")
+    changed = [
+        f"{name} {shown(before.get(name))} -> {shown(now.get(name))}"
+        for name in sorted(before.keys() | now.keys())
+        if before.get(name) != now.get(name)
+    ]
+    if changed:
+        raise UsageError(
+            f"{pieces.parent} was begun with other settings: {'; '.join(changed)}; give the same ones, or "
+            "remove it"
+        )
+    if isinstance(saved.get("meta"), dict):
+        say_what_differs(saved["meta"], dict(meta), str(pieces.parent))
+
+
+def _farewell(pieces: Path) -> str:
+    if has_work(pieces):
+        return f"stopped; what is finished is in {pieces.parent}, continue with --resume"
+    return "stopped before anything was finished; nothing was written"
