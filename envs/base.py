@@ -221,6 +221,15 @@ class Environment:
         del task
         return jnp.full((), jnp.nan)
 
+    def solvable(self, task: Task) -> Bool[Array, ""]:
+        """Whether anyone could solve a valid task within the horizon (default: yes).
+
+        A task that nobody can solve is refused where a user brings it, and never counts as solved: see
+        ``check_solvable``.
+        """
+        del task
+        return jnp.ones((), bool)
+
     def sample_goal(self, key: PRNGKeyArray) -> Float[Array, "G"]:
         """A random goal that can stand in a prompt, drawn without knowledge of the task.
 
@@ -243,9 +252,21 @@ class Environment:
         """Raise ``ValueError`` with a sentence on what is wrong with N stacked tasks.
 
         The default compares shapes and kinds of numbers with those of ``sample_task``, and refuses
-        numbers that are not finite. A world adds rules of its own, such as that a maze can be solved.
+        numbers that are not finite. A world adds rules of its own, such as what the walls of a maze are.
         """
         check_shapes(tasks, jax.eval_shape(self.sample_task, jax.random.key(0)))
+
+    def check_solvable(self, tasks: Task) -> None:
+        """Raise ``ValueError`` with a sentence on the first of N stacked tasks that is not ``solvable``.
+
+        The tasks are valid ones. A world may replace it by one that says why nobody can solve a task.
+        """
+        can = np.asarray(jax.jit(jax.vmap(self.solvable))(jax.tree.map(jnp.asarray, tasks)))
+        if not can.all():
+            raise ValueError(
+                f"task {int(np.argmin(can))}: nobody can solve it in the {self.spec.horizon} steps of an "
+                f"episode of {self.spec.name}"
+            )
 
 
 def _without_key(leaf: Array) -> Array:

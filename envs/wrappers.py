@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from envs.base import Engine, Environment, EnvSpec, State, Task, TimeStep
 
@@ -39,11 +39,17 @@ class Wrapper(Environment):
     def optimal_return(self, task: Task) -> Float[Array, ""]:
         return self.env.optimal_return(task)
 
+    def solvable(self, task: Task) -> Bool[Array, ""]:
+        return self.env.solvable(task)
+
     def fingerprint(self, task: Task) -> Int[Array, "F"]:
         return self.env.fingerprint(task)
 
     def check_task(self, tasks: Task) -> None:
         self.env.check_task(tasks)
+
+    def check_solvable(self, tasks: Task) -> None:
+        self.env.check_solvable(tasks)
 
     def reset(self, key: PRNGKeyArray, task: Task) -> tuple[State, TimeStep]:
         return self.env.reset(key, task)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import numpy as np
 
 import envs
 from envs.base import Episode
-from envs.errors import UsageError
+from envs.errors import UsageError, printable
 from envs.registry import World
 from experiments.figures import (
     STYLE,
@@ -22,49 +23,63 @@ from experiments.figures import (
     Save,
     figures_of_results,
     figures_of_run,
+    later,
     learning_curve,
 )
 from experiments.store.policies import load_policy_of
 from experiments.store.results import Results
+from experiments.store.seals import write_sealed
 from experiments.store.settings import file_name
+from experiments.store.statistics import same_tasks
 from mgpo_jax.prompts import prompt_of
 from mgpo_jax.rollout import Query
 from mgpo_jax.runner import play
 
+Picture = tuple[str, Save]
+"""The name of a file, and what writes it."""
+
 
 def draw_run(world: World, results: Results, folder: Path) -> None:
     """Draw into the folder of one adaptation what needs no policy."""
-    write(
-        folder / "learning_curve.png",
-        learning_curve({results.method: results}, results.env).savefig,
-    )
-    if world.pictures is None:
-        return
-    pictures = world.pictures(envs.make(results.env))
-    for name, save in figures_of_run(pictures, results, results.most_improved()):
+    curve = later(learning_curve, {results.method: results}, results.env)
+    drawn = [("learning_curve.png", curve)]
+    if world.pictures is not None:
+        pictures = world.pictures(envs.make(results.env))
+        drawn += figures_of_run(pictures, results, results.most_improved())
+    for name, save in drawn:
         write(folder / name, save)
 
 
-def draw_together(
-    results: Mapping[str, Results], out: Path, tasks: Sequence[int], seed: int
-) -> None:
-    """Draw every figure of some adaptations to the same tasks of one world."""
+def pictures_together(
+    results: Mapping[str, Results], tasks: Sequence[int], seed: int, policy: Path | None = None
+) -> list[Picture]:
+    """Every figure of some adaptations to the same tasks of one world, with nothing drawn yet.
+
+    All that drawing needs is there when this returns: the world, its pictures, and the policies.
+
+    Args:
+      results: adaptations by their labels in legends.
+      tasks: the tasks to draw (none: those that the first adaptation improved most).
+      seed: which seed of the adaptations to draw.
+      policy: folder of the policy of all of them (default: where it lay when they were made).
+    """
     first = next(iter(results.values()))
-    prefix = file_name(first.env)
-    write(out / f"{prefix}_learning_curve.png", learning_curve(results, first.env).savefig)
+    drawn = [("learning_curve.png", later(learning_curve, results, first.env))]
     world = envs.find(first.env)
-    if world.pictures is None:
-        return
-    pictures = world.pictures(envs.make(first.env))
-    which = tasks or first.most_improved()
-    for name, save in figures_of_results(pictures, results, player_of, which, seed):
-        write(out / f"{prefix}_{name}", save)
+    if world.pictures is not None:
+        pictures = world.pictures(envs.make(first.env))
+        for result in results.values():
+            result.task_set  # noqa: B018 (read and checked before anything is written)
+        which = tasks or first.most_improved()
+        players = lambda result: player_of(result, policy)  # noqa: E731
+        drawn += figures_of_results(pictures, results, players, which, seed)
+    return [(f"{file_name(first.env)}_{name}", save) for name, save in drawn]
 
 
-def player_of(results: Results) -> Play:
+def player_of(results: Results, policy_folder: Path | None = None) -> Play:
     """Who plays episodes under prompts: the policy that an adaptation was made with."""
     world, env = envs.find(results.env), envs.make(results.env)
-    policy = load_policy_of(results, world)
+    policy = load_policy_of(results, world, policy_folder)
 
     def play_goals(key: jax.Array, task: Any, goals: np.ndarray, num: int, greedy: bool) -> Episode:
         prompt = prompt_of(goals, policy.config.max_prompt_length)
@@ -99,10 +114,7 @@ def check_together(folders: Mapping[Path, Results], tasks: Sequence[int], seed: 
     """Raise ``UsageError`` for runs that no figure can compare, or that lack what is asked for."""
     first_folder, first = next(iter(folders.items()))
     for folder, result in folders.items():
-        same = result.tasks.keys() == first.tasks.keys() and all(
-            np.array_equal(array, first.tasks[name]) for name, array in result.tasks.items()
-        )
-        if not same:
+        if not same_tasks(result, first):
             raise UsageError(
                 f"{folder} and {first_folder} ran on different tasks; plot them one at a time"
             )
@@ -114,7 +126,9 @@ def check_together(folders: Mapping[Path, Results], tasks: Sequence[int], seed: 
 
 
 def write(path: Path, save: Save) -> None:
-    """Write one picture and say where it is."""
-    with mpl.rc_context(STYLE):
-        save(path)
-    print(path, file=sys.stderr)
+    """Write one picture, whole or not at all, and say where it is."""
+    with mpl.rc_context(STYLE), warnings.catch_warnings():
+        # A name that the font cannot write is drawn as boxes.
+        warnings.filterwarnings("ignore", message="Glyph .* missing from")
+        write_sealed(path, save)
+    print(printable(str(path)), file=sys.stderr)

@@ -9,8 +9,11 @@ from typing import NoReturn
 
 import tyro
 
+import envs
 from envs.errors import UsageError
 from experiments.runtime import Common, run
+from mgpo_jax.claims import check_place
+from mgpo_jax.settings import Index, Name
 
 
 @dataclass(frozen=True)
@@ -21,25 +24,41 @@ class PlotConfig(Common):
     """Result folders of adaptations; those of one world share its figures."""
     out: Path = Path("figures")
     """Folder to write."""
-    tasks: tuple[int, ...] = ()
+    tasks: tuple[Index, ...] = ()
     """Tasks to draw, counted from 0 (default: the four that the first run improved most)."""
-    seed: int = 0
+    seed: Index = 0
     """Which seed of the adaptations to draw, counted from 0."""
+    policy: Path | None = None
+    """Folder of the policy that the results were found with, where it is no longer at its place."""
+    env: Name | None = None
+    """A world of your own that the results name, as module:attribute: files alone import nothing."""
 
 
 def main(config: PlotConfig) -> None:
     """Draw every figure that the results of some adaptations allow."""
     if not config.runs:
         raise UsageError("no result folder given; usage: python -m experiments.plot RUN_DIR ...")
-    from experiments.drawing import by_world, check_together, draw_together, labeled
+    check_place(config.out)
+    if config.env is not None:
+        envs.find(config.env)  # from now on results may name its place
+    from experiments.drawing import by_world, check_together, labeled, pictures_together, write
     from experiments.store.results import load_results
+    from experiments.store.seals import check_replaceable
 
     groups = list(by_world(config.runs, load_results))
     for folders in groups:
         check_together(folders, config.tasks, config.seed)
+    pictures = {
+        config.out / name: save
+        for folders in groups
+        for name, save in pictures_together(
+            labeled(folders), config.tasks, config.seed, config.policy
+        )
+    }
+    check_replaceable(pictures, "choose another folder with --out")
     config.out.mkdir(parents=True, exist_ok=True)
-    for folders in groups:
-        draw_together(labeled(folders), config.out, config.tasks, config.seed)
+    for path, save in pictures.items():
+        write(path, save)
 
 
 def command(argv: Sequence[str] | None = None) -> NoReturn:

@@ -10,7 +10,7 @@ from typing import NoReturn
 import tyro
 
 from envs.errors import UsageError
-from experiments.runtime import Common, run
+from experiments.runtime import Common, run, say
 
 
 @dataclass(frozen=True)
@@ -22,13 +22,12 @@ class TableConfig(Common):
 
 
 def main(config: TableConfig) -> None:
-    """Print a Markdown table of adaptations beside the paper's Table 2."""
+    """Print a Markdown table of adaptations, where it is fair beside the paper's Table 2."""
     if not config.runs:
         raise UsageError("no result folder given; usage: python -m experiments.table RUN_DIR ...")
-    from experiments.store.results import read_summary
-    from experiments.store.tables import comparison
+    from experiments.store.rows import comparison, read_row
 
-    print(comparison([read_summary(folder) for folder in config.runs]))
+    say(comparison([read_row(folder) for folder in config.runs]))
 
 
 def command(argv: Sequence[str] | None = None) -> NoReturn:

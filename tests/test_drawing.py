@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,10 +20,11 @@ from envs.errors import DataError, UsageError
 from envs.gridworld import GRIDWORLD
 from envs.gridworld.env import NONE, GridWorld
 from envs.registry import WORLDS, World
-from experiments import drawing
+from experiments import drawing, evaluation
 from experiments.plot import PlotConfig, main
 from experiments.store.policies import check_weights
 from experiments.store.results import Results, save_results
+from experiments.store.summary import summarize
 from mgpo_jax.policy_files import read_policy, save_policy
 from mgpo_jax.prompts import prompt_of, single_goal
 from mgpo_jax.transformer import GoalTransformer, network_config
@@ -100,7 +103,12 @@ Save = Callable[[str, Results], Path]
 @pytest.fixture
 def save(tmp_path: Path) -> Iterator[Save]:
     def write(name: str, results: Results) -> Path:
-        save_results(tmp_path / name, results)
+        numbers = summarize(
+            results, policy_sha256="0" * 64, num_episodes=88, num_failed=0, cpu_seconds=2.0
+        )
+        if not results.summary:  # of a version that did not note the policy
+            del numbers["policy_sha256"]
+        save_results(tmp_path / name, replace(results, summary={**numbers, **results.summary}))
         return tmp_path / name
 
     return write
@@ -202,6 +210,7 @@ def test_other_weights_are_refused(tmp_path: Path, save: Save, policy: Path) -> 
     other = replace(results, summary={"policy_sha256": "0" * 64})
     with pytest.raises(DataError, match=r"not those that .* tiny ucb were found with \(0{12}\)"):
         main(PlotConfig(runs=(save("run", other),), out=tmp_path / "out", tasks=(0,)))
+    assert not (tmp_path / "out").exists()
     unknown = replace(results, summary={})  # of a version that did not note them
     check_weights(unknown, read_policy(policy), "")
     check_weights(results, read_policy(policy), "")
@@ -225,3 +234,136 @@ def test_command_refuses_what_it_cannot_draw(tmp_path: Path, save: Save, policy:
     with pytest.raises(DataError, match="no result folder"):
         main(PlotConfig(runs=(run, tmp_path / "nowhere"), out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()
+
+
+def test_our_own_pictures_are_replaced_and_changed_ones_kept(
+    tmp_path: Path, save: Save, policy: Path
+) -> None:
+    run, out = save("run", mazes(policy)), tmp_path / "out"
+    config = PlotConfig(runs=(run,), out=out, tasks=(1,))
+    main(config)
+    main(config)
+    before = {path: path.read_bytes() for path in out.iterdir()}
+    edited = out / "tiny_prompts.png"
+    iio.imwrite(edited, 255 - iio.imread(edited))
+    kept = edited.read_bytes()
+    (out / "tiny_learning_curve.png").unlink()
+    with pytest.raises(
+        UsageError, match=r"out/tiny_prompts\.png would be overwritten, but .*--out"
+    ):
+        main(config)
+    assert edited.read_bytes() == kept
+    assert not (out / "tiny_learning_curve.png").exists()
+    edited.unlink()
+    main(config)
+    assert {path: path.read_bytes() for path in out.iterdir()} == before
+
+
+def test_a_file_that_someone_else_wrote_is_no_place_for_a_picture(
+    tmp_path: Path, save: Save, policy: Path
+) -> None:
+    run, out = save("run", mazes(policy)), tmp_path / "out"
+    out.mkdir()
+    (out / "tiny_learning_curve.png").write_text("notes")
+    with pytest.raises(UsageError, match="would be overwritten"):
+        main(PlotConfig(runs=(run,), out=out))
+    assert [path.name for path in out.iterdir()] == ["tiny_learning_curve.png"]
+    with pytest.raises(UsageError, match=r"--out .*is no folder"):
+        main(PlotConfig(runs=(run,), out=run / "summary.json"))
+
+
+def test_a_picture_appears_whole_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / "picture.png"
+
+    def fail(place: Path) -> None:
+        place.write_bytes(b"half of it")
+        raise OSError("the disk is full")
+
+    with pytest.raises(OSError, match="full"):
+        drawing.write(path, fail)
+    assert not list(tmp_path.iterdir())
+
+
+def test_letters_that_the_font_lacks_make_no_noise(
+    tmp_path: Path, save: Save, policy: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    """Two runs of one method have their folders in the legend."""
+    runs = tuple(save(name, mazes(policy, env="plain")) for name in ("迷路", "$x_{$\\frac"))
+    main(PlotConfig(runs=runs, out=tmp_path / "out"))
+    assert not [str(one.message) for one in recwarn if "missing" in str(one.message)]
+    check_pictures(tmp_path / "out")
+
+
+def test_a_policy_that_was_moved_is_named(tmp_path: Path, save: Save, policy: Path) -> None:
+    moved = tmp_path / "moved"
+    run = save("run", mazes(policy_in(ENV, tmp_path / "first", num_slots=3)))
+    (tmp_path / "first").rename(moved)
+    config = PlotConfig(runs=(run,), out=tmp_path / "out", tasks=(1,))
+    with pytest.raises((UsageError, DataError), match="--policy"):
+        main(config)
+    assert not (tmp_path / "out").exists()
+    main(replace(config, policy=moved))
+    assert "tiny_ucb_episode_task1.gif" in names(tmp_path / "out")
+    other = policy_in(ENV, tmp_path / "other", num_slots=4)
+    with pytest.raises(DataError, match="are not those"):
+        main(replace(config, policy=other, out=tmp_path / "more"))
+    assert not (tmp_path / "more").exists()
+
+
+def test_worlds_that_files_name_are_only_imported_on_request(
+    tmp_path: Path, save: Save, policy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = "from made_results import TINY\nfrom dataclasses import replace\n"
+    (tmp_path / "named_in_a_file.py").write_text(source + "WORLD = replace(TINY, name='mine')\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    run = save("run", mazes(policy))
+    settings = run / "config.json"
+    settings.write_text(settings.read_text().replace('"tiny"', '"named_in_a_file:WORLD"'))
+    config = PlotConfig(runs=(run,), out=tmp_path / "out", tasks=(1,))
+    with pytest.raises(DataError, match="give it with --env named_in_a_file:WORLD"):
+        main(config)
+    assert "named_in_a_file" not in sys.modules
+    assert not (tmp_path / "out").exists()
+    main(replace(config, env="named_in_a_file:WORLD"))
+    assert "named_in_a_file.WORLD_learning_curve.png" in names(tmp_path / "out")
+
+
+@pytest.mark.parametrize("method", ["../../ucb", "/ucb", "a/b:c", "$\\frac{$", "u" * 300])
+def test_no_picture_lies_outside_of_the_folder(
+    tmp_path: Path, save: Save, policy: Path, method: str
+) -> None:
+    run = save("run", mazes(policy))
+    settings = json.loads((run / "config.json").read_text())
+    (run / "config.json").write_text(json.dumps({**settings, "method": method}))
+    with pytest.raises((DataError, UsageError)):
+        main(PlotConfig(runs=(run,), out=tmp_path / "out", tasks=(1,)))
+    assert {path.name for path in tmp_path.iterdir()} == {"run"}
+
+
+def test_evaluation_names_the_worlds_that_have_the_tasks(
+    save: Save, policy: Path, tmp_path: Path
+) -> None:
+    run = save("run", mazes(policy))
+    with pytest.raises(UsageError, match=r"--env short cannot run the tasks of tiny.*can: tiny"):
+        evaluation.open_case(run, "short", [evaluation.Noise()])
+    policy.rename(tmp_path / "moved")
+    try:
+        with pytest.raises(DataError, match="--policy"):
+            evaluation.open_case(run, None, [evaluation.Noise()])
+        case = evaluation.open_case(run, None, [evaluation.Noise()], tmp_path / "moved")
+        assert case.policy.folder == tmp_path / "moved"
+    finally:
+        (tmp_path / "moved").rename(policy)
+
+
+def test_rows_of_an_evaluation_say_what_they_are() -> None:
+    row = {
+        "folder": "runs/a", "env": "tiny", "optimizer": "ucb", "num_tasks": 2, "num_seeds": 1,
+        "episodes": 10, "adapted": 0.5, "noise": "none", "return": 0.25, "std_over_seeds": None,
+        "change": -0.25,
+    }  # fmt: skip
+    cells = dict(zip(evaluation.HEAD, evaluation.cells(row), strict=True))
+    assert (cells["folder"], cells["tasks x seeds x episodes"]) == ("runs/a", "2 x 1 x 10")
+    assert cells["return (mean ± std over seeds)"] == "0.250"
+    several = evaluation.cells({**row, "std_over_seeds": 0.125})
+    assert several[-2:] == ["0.250 ± 0.125", "-0.250"]

@@ -577,3 +577,36 @@ def test_the_horizon_is_a_setting():
     _, steps = walk_one(short, jax.random.key(0), padded([0, 1, 2]), np.full(5, STAY))
     assert steps.truncated.tolist() == [False, False, True, True, True]
     assert short.spec.horizon == 3
+
+
+# From object 3 to object 4 and to object 2: two ways of 2 steps, and 3 flips.
+SHORT_ORDER, SHORTEST = (3, 4, 2), [FLIP, EAST, EAST, FLIP, NORTH, NORTH, FLIP]
+
+
+def test_orders_that_no_episode_has_room_for_are_refused():
+    order = padded(SHORT_ORDER)
+    exact, short = (GridWorld(name="short", horizon=horizon) for horizon in (7, 6))
+    exact.check_solvable(GridTask(order[None]))
+    short.check_task(GridTask(order[None]))  # an order all the same
+    message = "task 0: the order takes at least 7 steps, an episode of short has 6"
+    with pytest.raises(ValueError, match=message):
+        short.check_solvable(GridTask(order[None]))
+    assert [bool(env.solvable(GridTask(jnp.asarray(order)))) for env in (exact, short)] == [
+        True,
+        False,
+    ]
+
+
+@pytest.mark.parametrize(("horizon", "solved"), [(7, True), (6, False)])
+def test_the_fewest_steps_are_enough_from_the_first_object(horizon, solved):
+    env = GridWorld(name="short", horizon=horizon)
+    state, timestep = env.reset(jax.random.key(0), GridTask(jnp.asarray(padded(SHORT_ORDER))))
+    state = state._replace(position=jnp.array(PLACES[3]))
+    for action in SHORTEST:
+        state, timestep = env.step(state, jnp.int32(action))
+    assert bool(timestep.terminated) == solved
+    assert int(state.num_solved) == (3 if solved else 2)
+
+
+def test_every_order_of_the_world_can_be_solved(all_tasks):
+    assert np.asarray(jax.jit(jax.vmap(WORLD.solvable))(GridTask(jnp.asarray(all_tasks)))).all()

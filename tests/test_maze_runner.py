@@ -10,6 +10,7 @@ import networkx as nx
 import numpy as np
 import pytest
 
+from envs.base import Environment
 from envs.maze.env import (
     EAST,
     NORTH,
@@ -21,6 +22,7 @@ from envs.maze.env import (
     cells_in_sight,
     generate_maze,
 )
+from envs.wrappers import Noisy
 
 TINY = MazeRunner(name="tiny", side=7, horizon=12)
 MAZE15 = MazeRunner(name="maze15", side=15, horizon=64)
@@ -306,6 +308,66 @@ class TestCheckTask:
         task.goal[1] = goal
         with pytest.raises(ValueError, match=message):
             TINY.check_task(task)
+
+    def test_the_last_step_may_reach_the_goal_and_no_later_one(self):
+        """The only way to the goal of the map has 10 steps."""
+        task = parse(TINY_MAP)
+        exact = MazeRunner(name="exact", side=7, horizon=len(TINY_WAY))
+        short = MazeRunner(name="short", side=7, horizon=len(TINY_WAY) - 1)
+        exact.check_solvable(self.good())
+        assert exact.solvable(task)
+        assert optimal_return(exact, task) == pytest.approx(0.0, abs=1e-6)
+        message = "task 0: the goal is 10 steps away, an episode of short has 9"
+        with pytest.raises(ValueError, match=message):
+            short.check_solvable(self.good())
+        short.check_task(self.good())  # a maze all the same
+        assert not short.solvable(task)
+        assert optimal_return(short, task) == pytest.approx(-0.9)
+        for env, arrives in ((exact, True), (short, False)):
+            _, positions, steps = walk(env, task, np.array(TINY_WAY))
+            assert (positions[-1] == task.goal).all() == arrives
+            assert bool(steps.terminated[-1]) == arrives
+            assert float(steps.reward.sum()) == pytest.approx(0.0 if arrives else -0.9, abs=1e-6)
+
+    def test_worlds_around_it_and_worlds_without_words_refuse_it_too(self):
+        class Silent(MazeRunner):
+            check_solvable = Environment.check_solvable
+
+        short = {"name": "short", "side": 7, "horizon": 9}
+        noisy = Noisy(MazeRunner(**short), obs_noise=0.1)
+        assert not noisy.solvable(parse(TINY_MAP))
+        with pytest.raises(ValueError, match="task 0: the goal is 10 steps away"):
+            noisy.check_solvable(self.good())
+        far_and_near = MazeTask(
+            *(np.stack(pair) for pair in zip(parse(TINY_MAP), parse(TINY_MAP), strict=True))
+        )
+        far_and_near.goal[0] = (3, 3)
+        message = "task 1: nobody can solve it in the 9 steps of an episode of short"
+        with pytest.raises(ValueError, match=message):
+            Silent(**short).check_solvable(far_and_near)
+
+    def test_a_goal_that_is_cut_off_cannot_be_reached(self):
+        task = parse(TINY_MAP)
+        cut_off = task._replace(maze=task.maze.at[1, 4].set(1))
+        assert TINY.solvable(task)
+        assert not TINY.solvable(cut_off)
+
+    def test_a_maze_whose_way_is_longer_than_an_episode(self):
+        """A snake of corridors through all of maze15: every second row is wall but for one end."""
+        maze = np.ones((1, 15, 15), np.int32)
+        maze[:, 1:14:2, 1:14] = 0
+        maze[:, 2:14:4, 13] = maze[:, 4:14:4, 1] = 0
+        task = MazeTask(maze, np.array([[1, 1]]))
+        length = int(nx.shortest_path_length(free_graph(maze[0]), MAZE15.start, (1, 1)))
+        assert length > 64
+        with pytest.raises(
+            ValueError, match=f"the goal is {length} steps away, an episode of maze"
+        ):
+            MAZE15.check_solvable(task)
+
+    def test_generated_tasks_fit_into_the_horizon(self, tasks15):
+        """Of 100,000 tasks of maze15 none was further than 52 steps, of 20,000 of maze30 none than 112."""
+        assert np.asarray(jax.jit(jax.vmap(MAZE15.solvable))(tasks15)).all()
 
     def test_bad_shapes_and_types(self):
         maze, goal = self.good()

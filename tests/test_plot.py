@@ -236,6 +236,47 @@ def test_repeated_and_unknown_methods_get_colors_of_their_own():
     assert len({style[1] for style in figures.METHODS.values()}) == len(figures.METHODS)
 
 
+FOREIGN = {
+    "a formula": (r"\frac{$ $x_1$", r"\frac{$ $x_1$"),
+    "one dollar": ("a$b", "a$b"),
+    "a line break": ("a\nb", r"a\nb"),
+    "an escape": ("\x1b[31mred", r"\x1b[31mred"),
+    "long": ("x" * 300, "x" * 28 + "..." + "x" * 28),
+}
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_names_from_files_are_shown_as_they_are(name, tmp_path):
+    """In titles and legends, and never as a formula; drawing the figure would fail on a broken one."""
+    text, shown = FOREIGN[name]
+    result = fake_results(text.replace(" ", ""))
+    figure = figures.learning_curve({text: result}, text)
+    figure.savefig(tmp_path / "curve.png")
+    for label in (figure.axes[0].title, *figure.legends[0].get_texts()[:1]):
+        drawn, is_math = label._preprocess_math(label.get_text())
+        assert (drawn, is_math) == (shown, False)
+    width, height = iio.imread(tmp_path / "curve.png").shape[:2]
+    assert max(width, height) < 2000
+
+
+def test_a_place_from_a_file_is_not_imported():
+    """Importing the module would fail."""
+    (look,) = figures.method_styles(["no_such_module:METHOD"]).values()
+    assert look.name == "no_such_module:METHOD"
+
+
+def test_nothing_is_drawn_before_it_is_written(monkeypatch, tmp_path):
+    drawn = []
+    for name in ("prompts", "evolution", "short_and_long", "video"):
+        monkeypatch.setattr(rollouts, name, lambda *args, name=name: drawn.append(name) or Figure())
+    results = {"ucb": fake_results()}
+    planned = list(figures.figures_of_results(PICTURES, results, lambda result: PLAY, (1,), 0))
+    assert len(planned) == 4
+    assert drawn == []
+    write_all(tmp_path, planned[:1])
+    assert drawn == ["prompts"]
+
+
 def test_final_prompts_of_all_methods_share_a_maze():
     results = {"ucb": fake_results(), "bbt": fake_results("bbt")}
     beyond = np.array([[9.0, 9.0], *results["bbt"].best_goals(0, 0)[1:]])

@@ -1,13 +1,21 @@
-"""IQM and bootstrap intervals against scipy and against what they must do."""
+"""IQM, bootstrap intervals and comparisons against scipy and against what they must do."""
 
 from __future__ import annotations
 
+from math import erf
+
 import numpy as np
 import pytest
-from scipy.stats import trim_mean
+from made_results import made_results
+from scipy.stats import bootstrap, mannwhitneyu, trim_mean
 
+from envs.errors import UsageError
 from experiments.store.statistics import (
+    Interval,
+    compare,
     interquartile_mean,
+    paired_difference,
+    same_tasks,
     seed_spread,
     stratified_bootstrap_iqm,
 )
@@ -49,3 +57,106 @@ def test_interval_covers_the_truth() -> None:
 def test_seed_spread_is_over_means_of_tasks() -> None:
     spread = seed_spread(np.array([[0.0, 2.0], [4.0, 6.0]]))
     assert spread == (3.0, 2.0)
+
+
+def test_one_seed_has_neither_spread_nor_interval() -> None:
+    scores = np.arange(8.0)[None]
+    assert seed_spread(scores) == (3.5, None)
+    assert str(seed_spread(scores)) == "3.500"
+    assert stratified_bootstrap_iqm(scores) == (3.5, None, None)
+    assert str(stratified_bootstrap_iqm(scores)) == "3.500"
+    assert paired_difference(scores, scores - 1) == (Interval(1.0), Interval(1.0))
+    several = np.repeat(scores, 3, axis=0)
+    assert paired_difference(scores, several).difference.low is None
+    assert paired_difference(several, several).difference == (0, 0, 0)
+
+
+def two_sets(num_a: int = 6, num_b: int = 4, num_tasks: int = 5) -> tuple[np.ndarray, np.ndarray]:
+    """Scores of two methods on tasks that differ a lot, with many ties."""
+    rng = np.random.default_rng(7)
+    worth = 10 * np.arange(num_tasks)
+    a = rng.integers(0, 4, size=(num_a, num_tasks)) + worth
+    b = rng.integers(-1, 4, size=(num_b, num_tasks)) + worth
+    return a.astype(float), b.astype(float)
+
+
+def test_the_probability_of_improvement_is_that_of_the_rank_test() -> None:
+    a, b = two_sets()
+    wins = [mannwhitneyu(x, y).statistic / (len(a) * len(b)) for x, y in zip(a.T, b.T, strict=True)]
+    found = paired_difference(a, b)
+    assert found.improvement.value == pytest.approx(np.mean(wins))
+    assert paired_difference(b, a).improvement.value == pytest.approx(1 - np.mean(wins))
+    assert paired_difference(a, a).improvement.value == 0.5  # ties count half
+    assert paired_difference(b + 9, a).improvement == (1, 1, 1)
+
+
+def test_intervals_are_those_of_scipy_with_each_task_of_each_method_as_a_stratum() -> None:
+    a, b = two_sets()
+    num = a.shape[1]
+
+    def difference(*strata: np.ndarray, axis: int = -1) -> np.ndarray:
+        means = [stratum.mean(axis=axis) for stratum in strata]
+        return np.mean(means[:num], axis=0) - np.mean(means[num:], axis=0)
+
+    def improvement(*strata: np.ndarray, axis: int = -1) -> np.ndarray:
+        pairs = zip(strata[:num], strata[num:], strict=True)
+        chances = [
+            (np.sign(x[..., :, None] - y[..., None, :]) / 2 + 0.5).mean(axis=(-2, -1))
+            for x, y in pairs
+        ]
+        return np.mean(chances, axis=0)
+
+    found = paired_difference(a, b, num_resamples=20_000)
+    for interval, statistic in zip(found, (difference, improvement), strict=True):
+        wanted = bootstrap(
+            (*a.T, *b.T),
+            statistic,
+            n_resamples=20_000,
+            method="percentile",
+            random_state=np.random.default_rng(1),
+        ).confidence_interval
+        assert interval.value == pytest.approx(float(statistic(*a.T, *b.T)))
+        width = wanted.high - wanted.low
+        assert interval.low == pytest.approx(wanted.low, abs=0.04 * width)
+        assert interval.high == pytest.approx(wanted.high, abs=0.04 * width)
+
+
+@pytest.mark.parametrize(("num_seeds", "least", "most"), [(3, 0.82, 0.96), (10, 0.91, 0.98)])
+def test_intervals_hold_the_truth_as_often_as_documented(
+    num_seeds: int, least: float, most: float
+) -> None:
+    rng = np.random.default_rng(num_seeds)
+    worth = np.linspace(-2, 2, 12)  # of the tasks, which are the same for both
+    truth = 0.3, 0.5 * (1 + erf(0.3 / 2))
+    held = np.zeros(2)
+    for trial in range(300):
+        a = rng.normal(size=(num_seeds, 12)) + worth + 0.3
+        b = rng.normal(size=(num_seeds, 12)) + worth
+        found = paired_difference(a, b, num_resamples=200, seed=trial)
+        held += [
+            interval.low <= true <= interval.high
+            for interval, true in zip(found, truth, strict=True)
+        ]
+    assert np.all((held / 300 >= least) & (held / 300 <= most)), held / 300
+
+
+def test_scores_of_different_tasks_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"same N tasks, found \[3, 4\] and \[3, 5\]"):
+        paired_difference(np.zeros((3, 4)), np.zeros((3, 5)))
+    with pytest.raises(ValueError, match="scores must be"):
+        paired_difference(np.zeros(4), np.zeros(4))
+
+
+def test_results_are_compared_on_the_same_tasks_only() -> None:
+    ucb, bbt = made_results(), made_results("bbt", shift=-1)
+    found = compare(ucb, bbt)
+    assert found.difference.value == pytest.approx(1)
+    assert found == paired_difference(ucb.eval_returns[:, :, -1], bbt.eval_returns[:, :, -1])
+    swapped = {name: array[::-1] for name, array in bbt.tasks.items()}
+    elsewhere = made_results("bbt", tasks=swapped)
+    assert same_tasks(ucb, bbt)
+    assert not same_tasks(ucb, elsewhere)
+    with pytest.raises(UsageError, match="tiny ucb and of tiny bbt are of different tasks"):
+        compare(ucb, elsewhere)
+    with pytest.raises(UsageError, match="different tasks"):
+        compare(ucb, made_results(tasks={"order": ucb.tasks["goal"]}))

@@ -96,6 +96,17 @@ class GridWorld(Environment):
         del task
         return jnp.ones(())
 
+    def solvable(self, task: GridTask) -> Bool[Array, ""]:
+        """Whether the horizon has room for the order from the best start, which is its first object."""
+        return self._fewest_steps(task) <= self.horizon
+
+    def _fewest_steps(self, task: GridTask) -> Int[Array, ""]:
+        """Steps from the first object on: the way to each next one, and a flip of each."""
+        places = jnp.asarray(OBJECTS)[task.order]
+        ways = jnp.abs(places[1:] - places[:-1]).sum(axis=1)
+        real = task.order != NONE
+        return jnp.sum(jnp.where(real[1:], ways, 0)) + jnp.sum(real)
+
     def fingerprint(self, task: GridTask) -> Int[Array, "F"]:
         """The order: a test order must not occur in training."""
         return task.order
@@ -120,6 +131,15 @@ class GridWorld(Environment):
                 raise ValueError(f"task {index}: {NONE} may only fill the end of an order")
             if len(np.unique(objects)) < len(objects):
                 raise ValueError(f"task {index}: an object occurs twice in {objects.tolist()}")
+
+    def check_solvable(self, tasks: GridTask) -> None:
+        batch = GridTask(jnp.asarray(tasks.order))
+        for index, steps in enumerate(jax.jit(jax.vmap(self._fewest_steps))(batch).tolist()):
+            if steps > self.horizon:
+                raise ValueError(
+                    f"task {index}: the order takes at least {steps} steps, an episode of {self.name} "
+                    f"has {self.horizon}"
+                )
 
     def reset(self, key: PRNGKeyArray, task: GridTask) -> tuple[GridState, TimeStep]:
         """All objects off, the agent on a random cell."""

@@ -92,14 +92,23 @@ class MazeRunner(Environment):
     def optimal_return(self, task: MazeTask) -> Float[Array, ""]:
         """1 - 0.1 x steps of the shortest path; the worst return where the goal is out of reach."""
         length = self._shortest_path(task)
-        reachable = (length >= 0) & (length <= self.horizon)
-        return jnp.where(
-            reachable, GOAL_REWARD - STEP_PENALTY * length, -STEP_PENALTY * self.horizon
-        )
+        best = GOAL_REWARD - STEP_PENALTY * length
+        return jnp.where(self._in_reach(length), best, -STEP_PENALTY * self.horizon)
+
+    def solvable(self, task: MazeTask) -> Bool[Array, ""]:
+        """Whether the last of the horizon's steps can reach the goal."""
+        return self._in_reach(self._shortest_path(task))
+
+    def _in_reach(self, length: Int[Array, ""]) -> Bool[Array, ""]:
+        return (length >= 0) & (length <= self.horizon)
 
     def _shortest_path(self, task: MazeTask) -> Int[Array, ""]:
         """Steps from the start to the goal; -1 where it is cut off."""
         return distances(task.maze == 0, jnp.asarray(self.start))[tuple(task.goal)]
+
+    def _shortest_paths(self, tasks: MazeTask) -> list[int]:
+        batch = jax.tree.map(jnp.asarray, tasks)
+        return jax.jit(jax.vmap(self._shortest_path))(batch).tolist()
 
     def fingerprint(self, task: MazeTask) -> Int[Array, "F"]:
         """The walls: a test maze must not occur in training with any goal."""
@@ -121,10 +130,17 @@ class MazeRunner(Environment):
                 raise ValueError(f"task {index}: goal ({row}, {column}) is not a free cell")
             if (row, column) == start:
                 raise ValueError(f"task {index}: goal ({row}, {column}) is the start cell")
-        batch = MazeTask(maze=jnp.asarray(maze), goal=jnp.asarray(goal))
-        for index, steps in enumerate(jax.jit(jax.vmap(self._shortest_path))(batch).tolist()):
+        for index, steps in enumerate(self._shortest_paths(tasks)):
             if steps < 0:
                 raise ValueError(f"task {index}: no free path leads from the start to the goal")
+
+    def check_solvable(self, tasks: MazeTask) -> None:
+        for index, steps in enumerate(self._shortest_paths(tasks)):
+            if steps > self.horizon:
+                raise ValueError(
+                    f"task {index}: the goal is {steps} steps away, an episode of {self.name} has "
+                    f"{self.horizon}"
+                )
 
     def reset(self, key: PRNGKeyArray, task: MazeTask) -> tuple[MazeState, TimeStep]:
         del key  # the start is always the same

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from experiments.figures.curves import learning_curve, training_curve
-from experiments.figures.rollouts import Play, Save, figures_of_results, figures_of_run
+from experiments.figures.rollouts import Play, Save, figures_of_results, figures_of_run, later
 from experiments.figures.style import METHODS, STYLE, Look, method_styles
 
 __all__ = [
@@ -14,6 +14,7 @@ __all__ = [
     "Save",
     "figures_of_results",
     "figures_of_run",
+    "later",
     "learning_curve",
     "method_styles",
     "training_curve",

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from envs.drawing import INK
-from experiments.figures.style import METHODS, method_styles, styled
+from experiments.figures.style import METHODS, method_styles, plain, styled
 
 if TYPE_CHECKING:
     from experiments.store.results import Results
@@ -41,7 +41,7 @@ def learning_curve(results: Mapping[str, Results], title: str | None = None) -> 
         ax.axhline(
             optimum, color=INK, linestyle=(0, (4, 3)), linewidth=1.0, label=label, zorder=1.8
         )
-    ax.set(xlabel="episodes", ylabel="return of the optimized prompt", title=title or "")
+    ax.set(xlabel="episodes", ylabel="return of the optimized prompt", title=plain(title or ""))
     ax.set_xlim(left=0)
     ax.margins(y=0.08)
     figure.legend(loc="outside right upper")

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,7 @@ from matplotlib.lines import Line2D
 from envs.base import Episode, Task
 from envs.drawing import Film, Pictures, Shown, Stage, observations, write_films
 from experiments.figures.style import method_styles, styled
+from experiments.store.settings import file_name
 from mgpo_jax.prompts import sample_prompt
 
 if TYPE_CHECKING:
@@ -48,9 +49,14 @@ def figures_of_run(
     """File name and writer of each figure that needs no policy, for some tasks of one adaptation."""
     if _has_prompts(result):
         if pictures.prompts:
-            yield "prompts.png", prompts(pictures, {result.method: result}, which).savefig
+            yield "prompts.png", later(prompts, pictures, {result.method: result}, which)
         if pictures.search:
-            yield "search.png", search(pictures, result, which).savefig
+            yield "search.png", later(search, pictures, result, which)
+
+
+def later(draw: Callable[..., Figure], *args: Any) -> Save:
+    """The writer of a figure that is only drawn when it is written."""
+    return lambda path: draw(*args).savefig(path)
 
 
 def figures_of_results(
@@ -61,6 +67,8 @@ def figures_of_results(
     seed: int,
 ) -> Iterator[tuple[str, Save]]:
     """File name and writer of each figure of some adaptations to the same tasks.
+
+    Nothing is drawn before its writer is called, but all players are there when the last name is known.
 
     Args:
       pictures: what the world draws.
@@ -73,23 +81,26 @@ def figures_of_results(
     if not results:
         return
     if pictures.prompts:
-        yield "prompts.png", prompts(pictures, results, which, seed).savefig
+        yield "prompts.png", later(prompts, pictures, results, which, seed)
     key = jax.random.key(seed)
     for number, (name, result) in enumerate(_file_names(results).items()):
         if pictures.search:
-            yield f"{name}_search.png", search(pictures, result, which, seed).savefig
+            yield f"{name}_search.png", later(search, pictures, result, which, seed)
         if not (pictures.visits or pictures.episodes or pictures.video or pictures.frame):
             continue
         play = play_with(result)
         if pictures.visits:
             if number == 0:
-                figure = short_and_long(pictures, result, play, which, key)
-                yield "short_and_long.png", figure.savefig
+                yield (
+                    "short_and_long.png",
+                    later(short_and_long, pictures, result, play, which, key),
+                )
             for task in which:
-                figure = evolution(pictures, result, play, task, seed, key)
-                yield f"{name}_evolution_task{task}.png", figure.savefig
+                draw = later(evolution, pictures, result, play, task, seed, key)
+                yield f"{name}_evolution_task{task}.png", draw
         if pictures.episodes:
-            yield f"{name}_episodes.png", episodes(pictures, result, play, which, seed, key).savefig
+            draw = later(episodes, pictures, result, play, which, seed, key)
+            yield f"{name}_episodes.png", draw
         if pictures.video or pictures.frame:
             save = partial(video, pictures, result, play, which[0], seed, key)
             yield f"{name}_episode_task{which[0]}.gif", save
@@ -275,7 +286,7 @@ def _file_names(results: Mapping[str, Results]) -> dict[str, Results]:
     """Results by method, and number where one method ran more than once."""
     names: dict[str, Results] = {}
     for number, result in enumerate(results.values()):
-        method = result.method
+        method = file_name(result.method)
         names[f"{method}_{number}" if method in names else method] = result
     return names
 

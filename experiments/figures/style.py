@@ -11,8 +11,9 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from envs.drawing import INK
-from envs.errors import UsageError
-from mgpo_jax import methods
+from envs.errors import DataError, printable
+from experiments.store.tables import shortened
+from mgpo_jax.methods import METHODS as KNOWN_METHODS
 
 STYLE: dict[Any, Any] = {
     "figure.dpi": 150,
@@ -34,6 +35,7 @@ STYLE: dict[Any, Any] = {
     "xtick.labelcolor": INK,
     "ytick.labelcolor": INK,
     "lines.markersize": 4,
+    "text.usetex": False,
 }
 
 
@@ -48,11 +50,19 @@ class Look(NamedTuple):
 
 
 def title_of(method: str) -> str:
-    """What legends call a method, by its name or place; the name itself for one that is not known."""
+    """What legends call a method, by its name or place; the name itself for one that is not known.
+
+    The name may come from a file: nothing is imported for it.
+    """
     try:
-        return methods.find(method).title or method
-    except UsageError:
+        return KNOWN_METHODS.known(method, "the results", "--method").title or method
+    except DataError:
         return method
+
+
+def plain(text: str) -> str:
+    """A text from a file as a picture shows it: on one line, not too long, and never as a formula."""
+    return shortened(printable(text)).replace("$", r"\$")
 
 
 METHODS = {
@@ -99,5 +109,5 @@ def method_styles(labels: Iterable[str]) -> dict[str, Look]:
         if look.color in taken or not look.color:
             look = Look(look.name, *next(spare))
         taken.add(look.color)
-        looks[label] = look._replace(name=f"{look.name} {remark}".strip())
+        looks[label] = look._replace(name=plain(f"{look.name} {remark}".strip()))
     return looks

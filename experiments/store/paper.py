@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from envs.errors import UsageError
-from envs.registry import find
+from envs.registry import WORLDS
 
 PAPER = Path(__file__).parent / "paper.toml"
 
@@ -27,10 +27,10 @@ def paper_rows(table: str, world: str) -> dict[str, Any]:
 def paper_value(table: str, world: str, row: str) -> str:
     """One number as the paper prints it; empty if it has none.
 
-    A world that acts with the policy of another one has that one's numbers.
+    A world that acts with the policy of another one has that one's numbers. The name may come from a file:
+    a place is not imported for it.
     """
-    with suppress(
-        UsageError
-    ):  # results of a world that is not installed here can still be compared
-        world = find(world).home
+    if world in WORLDS.names():
+        with suppress(UsageError):  # a world that cannot be imported has no other name
+            world = WORLDS.find(world).home
     return paper_rows(table, world).get(row, "")

@@ -1,20 +1,33 @@
-"""Aggregates of scores over tasks and seeds."""
+"""Aggregates of scores over tasks and seeds, and comparisons of two sets of scores.
+
+Intervals are those of Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical
+Precipice" (2021): seeds are drawn anew within each task, a stratum, and the interval lies between two
+percentiles of what is computed from them. One seed cannot be drawn anew, so that there is no interval.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from envs.errors import UsageError
+
+if TYPE_CHECKING:
+    from experiments.store.results import Results
+
 
 class Interval(NamedTuple):
-    """A point estimate with a confidence interval."""
+    """A point estimate with a confidence interval, whose ends are None where there is none."""
 
     value: float
-    low: float
-    high: float
+    low: float | None = None
+    high: float | None = None
 
     def __str__(self) -> str:
+        if self.low is None or self.high is None:
+            return f"{self.value:.3f}"
         return f"{self.value:.3f} [{self.low:.3f}, {self.high:.3f}]"
 
 
@@ -35,30 +48,114 @@ def interquartile_mean(scores: np.ndarray, axis: int = -1) -> np.ndarray:
 def stratified_bootstrap_iqm(
     scores: np.ndarray, confidence: float = 0.95, num_resamples: int = 2000, seed: int = 0
 ) -> Interval:
-    """IQM over seeds and tasks of scores [S, N], resampling seeds within each task.
-
-    The interval is the percentile interval of Agarwal et al. (2021), with tasks as strata.
-    """
-    num_seeds, num_tasks = scores.shape
+    """IQM over seeds and tasks of scores [S, N], with its interval."""
     rng = np.random.default_rng(seed)
-    rows = rng.integers(num_seeds, size=(num_resamples, num_seeds, num_tasks))
-    resampled = scores[rows, np.arange(num_tasks)].reshape(num_resamples, -1)
-    tail = 50 * (1 - confidence)
-    low, high = np.percentile(interquartile_mean(resampled), [tail, 100 - tail])
-    return Interval(float(interquartile_mean(scores.ravel())), float(low), float(high))
+    iqms = [interquartile_mean(_resampled(scores, rng).ravel()) for _ in range(num_resamples)]
+    value = float(interquartile_mean(scores.ravel()))
+    return _percentile_interval(value, iqms, confidence, len(scores))
 
 
 class SeedSpread(NamedTuple):
     """Mean over tasks and seeds, and the standard deviation over seeds of the mean over tasks."""
 
     mean: float
-    std: float
+    std: float | None
+    """None for one seed."""
 
     def __str__(self) -> str:
-        return f"{self.mean:.3f} ± {self.std:.3f}"
+        return f"{self.mean:.3f}" if self.std is None else f"{self.mean:.3f} ± {self.std:.3f}"
 
 
 def seed_spread(scores: np.ndarray) -> SeedSpread:
     """The paper's mean ± std of scores [S, N]."""
     means = scores.mean(axis=1)
-    return SeedSpread(float(means.mean()), float(means.std()))
+    return SeedSpread(float(means.mean()), float(means.std()) if len(means) > 1 else None)
+
+
+class Comparison(NamedTuple):
+    """How much better the first of two sets of scores is than the second."""
+
+    difference: Interval
+    """Mean of the first minus mean of the second."""
+    improvement: Interval
+    """Probability that, on a random task, a random seed of the first beats one of the second; ties count
+    half."""
+
+
+def paired_difference(
+    a: np.ndarray,
+    b: np.ndarray,
+    confidence: float = 0.95,
+    num_resamples: int = 2000,
+    seed: int = 0,
+) -> Comparison:
+    """Compare scores [S, N] on the same N tasks; the numbers of seeds may differ.
+
+    Tasks are paired and stay as they are: the intervals say how the outcome would vary with other seeds on
+    these tasks, not on other tasks. The seeds of both are drawn anew within each task. With few seeds a
+    bootstrap is too narrow: of intervals of 95 %, those of 3 seeds hold the truth about 88 times in 100,
+    those of 10 seeds about 95 times. A set with a single seed has no intervals.
+
+    Raises:
+      ValueError: if the scores are of different numbers of tasks.
+    """
+    if a.ndim != 2 or b.ndim != 2 or a.shape[1] != b.shape[1]:
+        raise ValueError(
+            f"scores must be [S, N] with the same N tasks, found {list(a.shape)} and {list(b.shape)}"
+        )
+    a, b = a.astype(np.float64), b.astype(np.float64)
+    rng = np.random.default_rng(seed)
+    drawn = ((_resampled(a, rng), _resampled(b, rng)) for _ in range(num_resamples))
+    resamples = [(_difference(*pair), _chance_to_beat(*pair)) for pair in drawn]
+    differences, chances = zip(*resamples, strict=True)
+    seeds = min(len(a), len(b))
+    return Comparison(
+        _percentile_interval(_difference(a, b), differences, confidence, seeds),
+        _percentile_interval(_chance_to_beat(a, b), chances, confidence, seeds),
+    )
+
+
+def _difference(a: np.ndarray, b: np.ndarray) -> float:
+    return float(a.mean() - b.mean())
+
+
+def _chance_to_beat(a: np.ndarray, b: np.ndarray) -> float:
+    """Share of pairs of seeds in which a is above b, over all tasks; ties count half."""
+    above, equal = a[:, None] > b[None], a[:, None] == b[None]
+    return float(np.mean(above + 0.5 * equal))
+
+
+def _resampled(scores: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Scores [S, N] whose seeds are drawn anew within each task."""
+    return scores[rng.integers(len(scores), size=scores.shape), np.arange(scores.shape[1])]
+
+
+def _percentile_interval(
+    value: float, resamples: Sequence[Any], confidence: float, num_seeds: int
+) -> Interval:
+    if num_seeds < 2:
+        return Interval(value)
+    tail = 50 * (1 - confidence)
+    low, high = np.percentile(resamples, [tail, 100 - tail])
+    return Interval(value, float(low), float(high))
+
+
+def same_tasks(a: Results, b: Results) -> bool:
+    """Whether two adaptations ran on the same tasks in the same order."""
+    return a.tasks.keys() == b.tasks.keys() and all(
+        np.array_equal(array, b.tasks[name]) for name, array in a.tasks.items()
+    )
+
+
+def compare(a: Results, b: Results) -> Comparison:
+    """Compare the final returns of two adaptations to the same tasks; see ``paired_difference``.
+
+    Raises:
+      UsageError: if they ran on different tasks.
+    """
+    if not same_tasks(a, b):
+        raise UsageError(
+            f"the results of {a.env} {a.method} and of {b.env} {b.method} are of different tasks, so that "
+            "they cannot be compared; adapt both to the same ones"
+        )
+    return paired_difference(a.eval_returns[:, :, -1], b.eval_returns[:, :, -1])

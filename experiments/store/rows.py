@@ -1,0 +1,180 @@
+"""Adaptations in one table. Each row says what it is of: the tasks, the size, and the settings that differ
+from the defaults. Nothing here imports jax, and nothing that a file names is imported.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from envs.errors import DataError
+from envs.registry import WORLDS, World
+from experiments.store.layout import ARRAYS, CONFIG, SUMMARY, TASKS
+from experiments.store.paper import paper_value
+from experiments.store.settings import AdaptConfig
+from experiments.store.statistics import Interval, SeedSpread
+from experiments.store.summary import ADAPT_AGAIN, Summary, check_against, method_of, read_summary
+from experiments.store.tables import number, shortened, table
+from mgpo_jax.methods import METHODS
+from mgpo_jax.released import released_folder
+from mgpo_jax.schema import ArrayField, array_names, read_arrays, read_document
+
+PAPER_EPISODES = 100  # the paper's budget for one task
+SHOWN = ("policy", "seed", "eval_every", "eval_episodes")  # settings that every method has
+STATED = {"policy", "seed"}  # may differ beside the paper's number, since the row states them
+
+
+class Row(NamedTuple):
+    """An adaptation in a table."""
+
+    folder: str
+    summary: Summary
+    tasks: str
+    """``test`` (those of the world), ``validation`` or ``own`` (of a user)."""
+    settings: Mapping[str, str]
+    """Those that differ from the defaults."""
+
+    @property
+    def like_the_paper(self) -> bool:
+        """Whether the paper's number may stand beside it."""
+        return (
+            self.tasks == "test"
+            and self.summary["num_episodes"] == PAPER_EPISODES
+            and not self.settings.keys() - STATED
+        )
+
+
+def read_row(folder: Path) -> Row:
+    """Read what a table says of an adaptation.
+
+    Raises:
+      DataError: if a file is missing or damaged, or the files contradict each other.
+    """
+    summary = read_summary(folder)
+    check_against(folder / ARRAYS, summary)
+    config = read_document(folder / CONFIG, dict[str, Any], ADAPT_AGAIN)
+    made = (config.get("env"), config.get("method", config.get("bandit")))
+    if made != (summary["env"], method_of(summary)):
+        raise DataError(
+            f"{folder / CONFIG} and {SUMMARY} name different worlds or methods; {ADAPT_AGAIN}"
+        )
+    # A place is not imported: what it is of stays unknown.
+    world = WORLDS.find(summary["env"]) if summary["env"] in WORLDS.names() else None
+    return Row(
+        folder=str(folder),
+        summary=summary,
+        tasks=kind_of_tasks(folder / TASKS, config, world),
+        settings=changed_settings(config, summary, world),
+    )
+
+
+def kind_of_tasks(path: Path, config: Mapping[str, Any], world: World | None) -> str:
+    """What the tasks of an adaptation are.
+
+    Where a world has released test tasks, only the very same ones are called so, whatever the settings
+    say.
+    """
+    stated = "validation" if config.get("validation") else "own"
+    released = released_folder(world) / TASKS if world else None
+    if released is None or not released.is_file():
+        return "test" if stated == "own" and config.get("tasks") is None else stated
+    tests, tasks = _all_arrays(released), _all_arrays(path)
+    same = tasks.keys() == tests.keys() and all(
+        np.array_equal(array, tests[name]) for name, array in tasks.items()
+    )
+    return "test" if same else stated
+
+
+def _all_arrays(path: Path) -> dict[str, np.ndarray]:
+    fields = {name: ArrayField(("N", ...), "anything") for name in array_names(path, ADAPT_AGAIN)}
+    return read_arrays(path, fields, mend=ADAPT_AGAIN)
+
+
+def changed_settings(
+    config: Mapping[str, Any], summary: Summary, world: World | None
+) -> dict[str, str]:
+    """The settings of an adaptation that differ from the defaults, as a table shows them."""
+    fields = {field.name: field.default for field in dataclasses.fields(AdaptConfig)}
+    changed = {
+        name: config[name] for name in SHOWN if config.get(name, fields[name]) != fields[name]
+    }
+    sha256 = summary.get("policy_sha256")
+    if "policy" not in changed and sha256 not in (None, _released_sha256(world, sha256)):
+        changed["policy"] = sha256[:12] if sha256 else ""
+    changed |= _changed_hyper(config, method_of(summary))
+    return {shortened(name): _told(value) for name, value in changed.items()}
+
+
+def _released_sha256(world: World | None, default: str | None) -> str | None:
+    """The hash of a world's released policy; the default where there is none."""
+    place = released_folder(world) / CONFIG if world else None
+    if place is None or not place.is_file():
+        return default
+    return json.loads(place.read_text())["sha256"]
+
+
+def _changed_hyper(config: Mapping[str, Any], method: str) -> dict[str, Any]:
+    """Hyper-parameters that differ from the method's defaults; of a place, all that are set."""
+    hyper = config.get("hyper")
+    if not isinstance(hyper, Mapping):  # the first version kept those of all methods together
+        options = config.get("options")
+        more = {name: config.get(name) for name in ("max_goals", "keep_rewarded")}
+        hyper = {**options, **more} if isinstance(options, Mapping) else more
+    given = {name: value for name, value in hyper.items() if value is not None}
+    if method not in METHODS.names():
+        return given
+    defaults = {f.name: f.default for f in dataclasses.fields(METHODS.find(method).hyper)}
+    return {n: value for n, value in given.items() if n in defaults and value != defaults[n]}
+
+
+def _told(value: Any) -> str:
+    """A setting as a table shows it."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return shortened(f"{value:g}" if isinstance(value, float) else str(value))
+
+
+HEAD = (
+    "folder", "env", "method", "tasks", "tasks x seeds x episodes", "settings", "initial",
+    "final (mean ± std over seeds)", "IQM [95 %]", "optimum", "regret", "after 40",
+    "solved optimally", "paper: final",
+)  # fmt: skip
+
+
+def comparison(rows: Sequence[Row]) -> str:
+    """Adaptations beside the paper's Table 2, one row for each, in the order given."""
+    return table(HEAD, [_cells(row) for row in rows])
+
+
+def _cells(row: Row) -> list[str]:
+    summary = row.summary
+    env, method = summary["env"], method_of(summary)
+    low, high = summary["final_return_iqm_95"] or (None, None)
+    return [
+        row.folder,
+        env,
+        method,
+        row.tasks,
+        f"{summary['num_tasks']} x {summary['num_seeds']} x {summary['num_episodes']}",
+        ", ".join(f"{name}={value}" for name, value in row.settings.items()),
+        f"{summary['initial_return']:.2f}",
+        str(SeedSpread(summary["final_return"], summary["final_return_std_over_seeds"])),
+        str(Interval(summary["final_return_iqm"], low, high)),
+        number(summary["optimal_return"]),
+        number(summary["regret"]),
+        number(summary["regret_after_40"]),
+        _share(summary["solved_optimally"], summary.get("unsolvable_tasks", 0)),
+        paper_value("table2", env, method) if row.like_the_paper else "",
+    ]
+
+
+def _share(solved: float | None, num_unsolvable: int) -> str:
+    if solved is None:
+        return ""
+    mark = f" ({num_unsolvable} tasks unsolvable)" if num_unsolvable else ""
+    return f"{100 * solved:.0f} %{mark}"

@@ -1,0 +1,83 @@
+"""Pictures and tables that a command may replace: those that a command wrote and nobody has changed.
+
+Such a file carries a seal, a comment with the hash of everything else in it. A file without a seal, or
+whose seal is not that of its content, belongs to somebody else and is never overwritten.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import struct
+import zlib
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from envs.errors import UsageError
+from mgpo_jax.files import written
+
+_LABEL = "mgpo_jax, sha256 of the rest: "
+
+
+def _note(content: bytes) -> bytes:
+    return (_LABEL + hashlib.sha256(content).hexdigest()).encode()
+
+
+def _markdown(content: bytes) -> tuple[bytes, bytes]:
+    return b"\n<!-- " + _note(content) + b" -->\n", b""
+
+
+def _png(content: bytes) -> tuple[bytes, bytes]:
+    """A text chunk before the last chunk, which always has 12 bytes."""
+    chunk = b"tEXt" + b"Comment\0" + _note(content)
+    size, check = struct.pack(">I", len(chunk) - 4), struct.pack(">I", zlib.crc32(chunk))
+    return size + chunk + check, content[-12:]
+
+
+def _gif(content: bytes) -> tuple[bytes, bytes]:
+    """A comment before the last byte, which ends a GIF."""
+    note = _note(content)
+    return b"\x21\xfe" + bytes([len(note)]) + note + b"\0", content[-1:]
+
+
+_SEALS: dict[str, Callable[[bytes], tuple[bytes, bytes]]] = {
+    ".md": _markdown,
+    ".png": _png,
+    ".gif": _gif,
+}
+"""By suffix: the seal of some content, and the end of the content that has to stand after it."""
+
+
+def sealed(content: bytes, suffix: str) -> bytes:
+    """The content of a file with its seal."""
+    seal, end = _SEALS[suffix](content)
+    return content[: len(content) - len(end)] + seal + end
+
+
+def is_sealed(content: bytes, suffix: str) -> bool:
+    """Whether the content of a file is as a command wrote it."""
+    seal, end = _SEALS[suffix](content)
+    at = len(content) - len(end) - len(seal)  # all seals of one kind have the same length
+    return at >= 0 and sealed(content[:at] + end, suffix) == content
+
+
+def check_replaceable(paths: Iterable[Path], *ways_out: str) -> None:
+    """Raise ``UsageError`` with the ways out if files are there that no command wrote as they are."""
+    foreign = [str(path) for path in paths if os.path.lexists(path) and not _is_ours(path)]
+    if foreign:
+        more = f" and {len(foreign) - 3} more" if len(foreign) > 3 else ""
+        raise UsageError(
+            f"{', '.join(foreign[:3])}{more} would be overwritten, but was not written by this command or "
+            f"was changed since; {', or '.join(('move it away', *ways_out))}"
+        )
+
+
+def _is_ours(path: Path) -> bool:
+    return path.is_file() and not path.is_symlink() and is_sealed(path.read_bytes(), path.suffix)
+
+
+def write_sealed(path: Path, save: Callable[[Path], object]) -> None:
+    """Write a picture or a table by ``save``, with its seal, whole or not at all."""
+    with written(path) as partial:
+        save(partial)
+        partial.write_bytes(sealed(partial.read_bytes(), path.suffix))

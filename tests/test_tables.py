@@ -1,0 +1,340 @@
+"""Summaries and tables: what a row says it is of, what contradicts, and nothing raw from a file."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from made_results import TINY, made_results
+from test_architecture import call_without_jax
+
+from envs.errors import DataError, UsageError
+from envs.registry import WORLDS
+from experiments.store.results import Results, save_results
+from experiments.store.rows import HEAD, Row, comparison, read_row
+from experiments.store.seals import check_replaceable, is_sealed, sealed, write_sealed
+from experiments.store.summary import printed, read_summary, solvable_tasks, summarize
+from experiments.store.tables import block, shortened, table
+from experiments.table import TableConfig, main
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "results"
+PUBLISHED = sorted(path.parent for path in RESULTS.rglob("summary.json"))
+ONE_PUBLISHED = RESULTS / "maze15" / "ucb"
+
+
+@pytest.fixture
+def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The world of the made results, under its name."""
+    monkeypatch.setitem(WORLDS._registered, "tiny", TINY)
+
+
+def summary_of(results: Results) -> dict[str, Any]:
+    return summarize(
+        results, policy_sha256="0" * 64, num_episodes=88, num_failed=0, cpu_seconds=2.0
+    )
+
+
+def saved(folder: Path, **changes: Any) -> Path:
+    """Made results of the world ``tiny`` as a folder."""
+    results = made_results(**changes)
+    save_results(folder, replace(results, summary=summary_of(results)))
+    return folder
+
+
+@pytest.fixture
+def copied(tmp_path: Path) -> Path:
+    """A copy of published results, to be changed."""
+    shutil.copytree(ONE_PUBLISHED, tmp_path / "ucb")
+    return tmp_path / "ucb"
+
+
+def change(path: Path, **changes: Any) -> None:
+    document = {**json.loads(path.read_text()), **changes}
+    path.write_text(json.dumps({k: v for k, v in document.items() if v is not ...}))
+
+
+def cells(row: Row) -> dict[str, str]:
+    head, _, line = comparison([row]).splitlines()
+    parts = [re.split(r" (?<!\\)\| ", text[2:-2]) for text in (head, line)]
+    return dict(zip(*parts, strict=True))
+
+
+@pytest.mark.parametrize(
+    "folder", PUBLISHED, ids=lambda folder: str(folder.relative_to(RESULTS)).replace("/", "-")
+)
+def test_published_results_have_rows(folder: Path) -> None:
+    row = read_row(folder)
+    assert row.tasks == "test"
+    found = cells(row)
+    assert found["folder"] == str(folder)
+    one_seed = row.summary["num_seeds"] == 1
+    assert ("±" in found["final (mean ± std over seeds)"]) != one_seed
+    assert ("[" in found["IQM [95 %]"]) != one_seed
+    as_printed = folder.name == "ucb-as-printed"
+    assert (found["settings"] == "keep_rewarded=false") == as_printed
+    assert (found["paper: final"] == "") == as_printed
+
+
+def test_the_published_table_is_that_of_the_results(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(ROOT)
+    worlds, methods = (
+        ("maze15", "maze30", "gridworld", "kitchen"),
+        ("ucb", "bpe", "explore", "grips", "bbt"),
+    )
+    main(TableConfig(runs=tuple(Path("results", w, m) for w in worlds for m in methods)))
+    assert capsys.readouterr().out == Path("results/table.md").read_text()
+
+
+def test_a_table_needs_no_jax() -> None:
+    assert call_without_jax(["table results/maze15/ucb results/kitchen/bpe"]) == ["0|False|"]
+
+
+def test_a_policy_that_was_not_released_is_stated() -> None:
+    row = read_row(RESULTS / "ablations/kitchen/mixture/ucb")
+    assert row.settings == {"policy": "2d3d3ab0106b"}
+    assert cells(row)["paper: final"] == "0.63 ± 0.02"  # beside a stated policy
+
+
+@pytest.mark.parametrize(
+    ("changes", "settings", "fair"),
+    [
+        ({}, {}, True),
+        ({"seed": 4}, {"seed": "4"}, True),
+        ({"policy": "runs/mine"}, {"policy": "runs/mine"}, True),
+        ({"eval_episodes": 3}, {"eval_episodes": "3"}, False),
+        ({"eval_every": 5}, {"eval_every": "5"}, False),
+        ({"hyper": {"max_goals": None, "keep_rewarded": True, "c": 2.0}}, {"c": "2"}, False),
+        ({"hyper": {"max_goals": 7, "c": 1}}, {"max_goals": "7"}, False),
+        ({"policy": "x" * 300}, {"policy": "x" * 28 + "..." + "x" * 28}, True),
+        ({"figures": False, "out": "elsewhere", "debug": True}, {}, True),
+    ],
+)
+def test_settings_that_differ_from_the_defaults(
+    copied: Path, changes: dict[str, Any], settings: dict[str, str], fair: bool
+) -> None:
+    change(copied / "config.json", **changes)
+    row = read_row(copied)
+    assert row.settings == settings
+    assert row.like_the_paper == fair
+    found = cells(row)
+    assert found["settings"] == ", ".join(f"{name}={text}" for name, text in settings.items())
+    assert (found["paper: final"] == "-0.41 ± 0.10") == fair
+
+
+def test_test_tasks_are_known_by_what_they_are(copied: Path) -> None:
+    """Whatever the settings say."""
+    change(copied / "config.json", tasks="mine.npz", validation=False)
+    assert read_row(copied).tasks == "test"
+    with np.load(copied / "tasks.npz") as file:
+        tasks = dict(file)
+    tasks["goal"][3] = tasks["goal"][4]
+    np.savez(copied / "tasks.npz", **tasks)
+    row = read_row(copied)
+    assert (row.tasks, cells(row)["paper: final"]) == ("own", "")
+    change(copied / "config.json", tasks=None)
+    assert read_row(copied).tasks == "own"
+    change(copied / "config.json", validation=True)
+    assert read_row(copied).tasks == "validation"
+
+
+def test_tasks_of_a_world_without_released_ones(tmp_path: Path, tiny: None) -> None:
+    folder = saved(tmp_path / "run")
+    assert read_row(folder).tasks == "test"
+    change(folder / "config.json", tasks="mine.npz")
+    assert read_row(folder).tasks == "own"
+    assert cells(read_row(folder))["tasks x seeds x episodes"] == "2 x 2 x 20"
+
+
+def test_another_budget_is_not_the_papers(tmp_path: Path, copied: Path) -> None:
+    row = read_row(copied)
+    other = row._replace(summary={**row.summary, "num_episodes": 50})
+    assert (cells(row)["paper: final"], cells(other)["paper: final"]) == ("-0.41 ± 0.10", "")
+
+
+def test_a_place_is_shown_and_never_imported(copied: Path) -> None:
+    """The module of the world does not exist, so that importing it would fail."""
+    for name in ("summary.json", "config.json"):
+        change(copied / name, env="no_such_module:WORLD", method="no_such_module:METHOD")
+    row = read_row(copied)
+    found = cells(row)
+    assert (found["env"], found["method"]) == ("no_such_module:WORLD", "no_such_module:METHOD")
+    assert row.settings == {"keep_rewarded": "true", "c": "1"}  # what the defaults are is unknown
+    assert found["paper: final"] == ""
+
+
+WRONG = {
+    "a number is missing": ({"regret": ...}, "lacks regret"),
+    "null": ({"final_return": None}, "final_return must be a number, found None"),
+    "text": ({"initial_return": "-1.5"}, "initial_return must be a number, found '-1.5'"),
+    "true": ({"final_return": True}, "final_return must be a number, found True"),
+    "NaN": ({"regret": float("nan")}, "regret"),
+    "infinity": ({"cpu_seconds": float("inf")}, "cpu_seconds"),
+    "too much": ({"solved_optimally": 7.3}, "solved_optimally must be at most 1, found 7.3"),
+    "too little": ({"num_seeds": 0}, "num_seeds must be at least 1, found 0"),
+    "half an interval": ({"final_return_iqm_95": [1.0]}, r"final_return_iqm_95"),
+    "a list": ({"env": ["maze15"]}, r"env must be text, found \['maze15'\]"),
+    "no world": ({"env": "maze51"}, "unknown world 'maze51'; did you mean 'maze15'"),
+    "no method": ({"method": "ubc"}, "unknown method 'ubc'; did you mean 'ucb'"),
+    "an escape": ({"env": "\x1b[31mmaze15"}, r"unknown world '\\x1b\[31mmaze15'"),
+    "two lines": ({"env": "maze15\n"}, r"unknown world 'maze15\\n'"),
+    "a cell": ({"env": "a | b"}, r"unknown world 'a \| b'"),
+    "long": ({"env": "m" * 300}, "env"),
+    "no hash": ({"policy_sha256": "abc"}, "policy_sha256"),
+    "unknown": ({"speed": 3}, "has the unknown entry speed"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_numbers_are_named_with_the_way_out(copied: Path, name: str) -> None:
+    changes, says = WRONG[name]
+    change(copied / "summary.json", **changes)
+    with pytest.raises(DataError, match=says) as error:
+        read_summary(copied)
+    text = str(error.value)
+    assert str(copied / "summary.json") in text
+    assert text.endswith("adapt again with `python -m experiments.adapt`")
+    assert text.isprintable()
+
+
+@pytest.mark.parametrize("content", ["[]", "3", "{", "null", '"a"', ""])
+def test_what_is_no_summary_is_refused(copied: Path, content: str) -> None:
+    (copied / "summary.json").write_text(content)
+    with pytest.raises(
+        DataError, match=r"summary\.json (is not readable JSON|does not hold a JSON)"
+    ):
+        read_summary(copied)
+    (copied / "summary.json").unlink()
+    with pytest.raises(DataError, match=r"summary\.json is missing; adapt again"):
+        read_summary(copied)
+
+
+CONTRADICTIONS = {
+    "initial_return": 1e12,
+    "final_return": -0.3,
+    "final_return_std_over_seeds": 0.5,
+    "final_return_iqm": 0.0,
+    "final_return_iqm_95": [-1.0, 1.0],
+    "num_tasks": 10**12,
+    "num_seeds": 4,
+    "num_episodes": 99,
+    "regret": 0.0,
+    "regret_after_40": 0.1,
+}
+
+
+@pytest.mark.parametrize("name", CONTRADICTIONS)
+def test_a_summary_of_other_results_is_refused(copied: Path, name: str) -> None:
+    value = CONTRADICTIONS[name]
+    change(copied / "summary.json", **{name: value})
+    with pytest.raises(DataError, match=rf"summary\.json: {name} is .*, by results\.npz it is"):
+        read_row(copied)
+
+
+def test_files_of_different_adaptations_are_refused(copied: Path) -> None:
+    change(copied / "config.json", method="bpe")
+    with pytest.raises(DataError, match=r"config\.json and summary\.json name different worlds or"):
+        read_row(copied)
+
+
+def test_optimum_and_solved_are_known_together(copied: Path) -> None:
+    unknown = dict.fromkeys(
+        ("optimal_return", "regret", "regret_after_40", "regret_std_over_seeds")
+    )
+    change(copied / "summary.json", **unknown)
+    with pytest.raises(DataError, match=r"regret_after_40|solved_optimally needs optimal_return"):
+        read_row(copied)
+    change(copied / "summary.json", solved_optimally=None)
+    assert cells(read_row(copied))["solved optimally"] == ""
+
+
+def test_one_seed_prints_no_spread(tmp_path: Path, tiny: None) -> None:
+    several = made_results()
+    one = {name: getattr(several, name)[:1] for name in ("returns", "eval_returns", "actions")}
+    parts = {name: array[:1] for name, array in several.choices.items()}
+    folder = saved(tmp_path / "run", **one, choices=parts, best=parts, reached=None)
+    summary = json.loads((folder / "summary.json").read_text())
+    nothing = ("final_return_std_over_seeds", "final_return_iqm_95", "regret_std_over_seeds")
+    assert [summary[name] for name in nothing] == [None] * 3
+    for text in (printed(summary), comparison([read_row(folder)]).splitlines()[2]):
+        assert "±" not in text
+        assert not re.search(r"\[-?\d", text)
+    # Older versions wrote a spread of 0 and an interval without a width.
+    change(folder / "summary.json", **dict.fromkeys((nothing[0], nothing[2]), 0.0))
+    change(folder / "summary.json", final_return_iqm_95=[0.0, 0.0])
+    assert [read_summary(folder)[name] for name in nothing] == [None] * 3
+    assert "±" not in comparison([read_row(folder)]).splitlines()[2]
+
+
+def test_a_task_that_nobody_can_solve_never_counts_as_solved(tmp_path: Path, tiny: None) -> None:
+    """The second goal is cut off: the worst return is then the best one, and no regret is left."""
+    results = made_results()
+    mazes = results.tasks["maze"].copy()
+    mazes[1][4, 1] = mazes[1][5, 2] = 1
+    evals = np.stack([results.eval_returns[:, 0], np.full((2, 2), -0.6)], axis=1)
+    cut_off = made_results(
+        tasks={**results.tasks, "maze": mazes},
+        eval_returns=evals.astype(np.float32),
+        optimal_returns=np.array([0.5, -0.6], np.float32),
+    )
+    assert solvable_tasks(cut_off).tolist() == [True, False]
+    summary = summary_of(cut_off)
+    assert (summary["solved_optimally"], summary["unsolvable_tasks"]) == (0, 1)
+    assert "unsolvable tasks 1 of 2 (never within the horizon)" in printed(summary)
+    save_results(tmp_path / "run", replace(cut_off, summary=summary))
+    assert cells(read_row(tmp_path / "run"))["solved optimally"] == "0 % (1 tasks unsolvable)"
+    solved = summary_of(made_results())
+    assert solved["unsolvable_tasks"] == 0
+    assert "unsolvable" not in printed(solved)
+
+
+def test_cells_stay_cells() -> None:
+    rows = [["a|b", "two\nlines", "\x1b[31mred", "x\u202ey"]]
+    text = table(["w", "x", "y", "z"], rows)
+    assert text.splitlines()[2] == r"| a\|b | two\nlines | \x1b[31mred | x\u202ey |"
+    plain = table(["w", "x", "y", "z"], rows, markdown=False)
+    assert plain.splitlines()[1] == r"a|b two\nlines \x1b[31mred x\u202ey"
+    assert block("a\nb", [("c\r", "d")]).splitlines() == [r"a\nb", "----", r"c\r d"]
+    assert shortened("a" * 60) == "a" * 60
+    assert shortened("a" * 30 + "b" * 31) == "a" * 28 + "..." + "b" * 28
+
+
+def test_folders_are_escaped(tmp_path: Path) -> None:
+    folder = tmp_path / "a|b\nc\x1b[31m"
+    shutil.copytree(ONE_PUBLISHED, folder)
+    text = comparison([read_row(folder)])
+    assert len(text.splitlines()) == 3
+    assert r"a\|b\nc\x1b[31m" in text
+    assert len(re.findall(r"(?<!\\)\|", text.splitlines()[2])) == len(HEAD) + 1
+
+
+@pytest.mark.parametrize("suffix", [".md", ".png", ".gif"])
+def test_only_what_was_written_by_a_command_is_replaced(tmp_path: Path, suffix: str) -> None:
+    path, content = tmp_path / f"made{suffix}", bytes(range(256)) * 2
+    check_replaceable([path])
+    write_sealed(path, lambda place: place.write_bytes(content))
+    assert path.read_bytes() == sealed(content, suffix)
+    check_replaceable([path])
+    write_sealed(path, lambda place: place.write_bytes(content + content))
+    assert is_sealed(path.read_bytes(), suffix)
+    whole = path.read_bytes()
+    for changed in (content, whole[:-1], whole[1:], whole + b"\n", b"x" + whole[1:], b""):
+        path.write_bytes(changed)
+        with pytest.raises(
+            UsageError, match=r"would be overwritten, but .*move it away, or call mom"
+        ):
+            check_replaceable([path], "call mom")
+        assert path.read_bytes() == changed
+    path.unlink()
+    path.symlink_to(tmp_path / "nowhere")
+    with pytest.raises(UsageError, match="would be overwritten"):
+        check_replaceable([path])
+    assert [other.name for other in tmp_path.iterdir()] == [path.name]
