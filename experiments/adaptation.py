@@ -20,7 +20,7 @@ from experiments.store.settings import AdaptConfig
 from experiments.store.summary import summarize
 from experiments.store.work import long_work
 from mgpo_jax import methods
-from mgpo_jax.files import hash_arrays, to_json
+from mgpo_jax.files import hash_arrays, remove_leftovers, to_json
 from mgpo_jax.journal import Journal
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.runner import Outcome, sweep
@@ -81,6 +81,7 @@ def finished(folder: Path, config: AdaptConfig, policy: LoadedPolicy) -> Results
     Raises:
       UsageError: if they are of other settings.
     """
+    remove_leftovers(folder)
     results = load_results(folder)
     check_weights(results, policy, f"remove {folder}, or choose another with --out")
     if deciding(results.config) != deciding(to_json(config)):

@@ -30,7 +30,7 @@ from experiments.store.settings import CollectConfig, PretrainConfig, dataset_fo
 from experiments.store.work import long_work
 from mgpo_jax.claims import check_place
 from mgpo_jax.dataset import STEP_ARRAYS, Dataset, hash_task, load_dataset, write_dataset
-from mgpo_jax.files import ExistsError
+from mgpo_jax.files import ExistsError, remove_leftovers
 from mgpo_jax.journal import Journal
 from mgpo_jax.progress import Progress
 from mgpo_jax.runner import together
@@ -241,12 +241,15 @@ def _describe(values: np.ndarray) -> dict[str, Any]:
     }
 
 
-def collect_and_save(config: CollectConfig, wait: bool = False) -> None:
+def collect_and_save(
+    config: CollectConfig, wait: bool = False, go_on: str = "continue with --resume"
+) -> None:
     """Collect a dataset and write it to its folder.
 
     Args:
       config: settings of the command.
       wait: wait for another process that collects the same dataset.
+      go_on: what continues it after a stop, for messages.
 
     Raises:
       DataError: if the folder exists, or another process makes it.
@@ -263,13 +266,14 @@ def collect_and_save(config: CollectConfig, wait: bool = False) -> None:
     }
     asked = {**made, "trajectories": config.trajectories}
     if config.resume and os.path.isdir(folder):
+        remove_leftovers(folder)
         load_dataset(folder, env.spec, {**made, "num_trajectories": config.trajectories})
         print(f"{folder} is finished already", file=sys.stderr)
         return
     if not wait:
         refuse_existing(folder, "remove it", "choose another with --out")
     check_place(folder, num_bytes=config.trajectories * SMALLEST_TRAJECTORY)
-    with long_work(folder, asked, provenance(), config.resume, wait) as (place, journal):
+    with long_work(folder, asked, provenance(), config.resume, wait, go_on) as (place, journal):
         cpu = time.process_time()
         dataset, facts = collect(
             env, demonstrator, config.trajectories, config.seed, world.num_test_tasks, journal
@@ -287,12 +291,12 @@ def collect_and_save(config: CollectConfig, wait: bool = False) -> None:
 
 
 def prepare_dataset(
-    config: PretrainConfig, world: World, env: Environment
+    config: PretrainConfig, world: World, env: Environment, go_on: str
 ) -> tuple[Dataset, Path, str]:
     """The dataset of a training, its folder and its hash; no test task is in it.
 
     It is collected first where it is not there yet. Where another process collects it, that one is waited
-    for.
+    for. ``go_on`` says what continues the command after a stop.
 
     Raises:
       DataError: if the dataset there is damaged, out of date or holds a test task.
@@ -310,7 +314,7 @@ def prepare_dataset(
         text = f"no dataset in {folder} yet: {wanted.trajectories} trajectories are collected first"
         print(text, file=sys.stderr)
         with suppress(ExistsError):  # another process has collected it meanwhile
-            collect_and_save(replace(wanted, resume=True), wait=True)
+            collect_and_save(replace(wanted, resume=True), True, go_on)
     made = {
         "env": config.env,
         "policy": name,

@@ -21,6 +21,7 @@ import sys
 import tempfile
 import threading
 import traceback
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,10 +29,9 @@ from typing import Any, NoReturn
 
 from envs.errors import DataError, UsageError, printable, shown
 from experiments import signals
-from mgpo_jax.claims import check_place
+from mgpo_jax.claims import NO_ROOM, check_place
 
 EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
-NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
 # mallopt parameters of the GNU C library
 M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -2, -3, -8
@@ -59,14 +59,21 @@ def configure() -> None:
         libc.mallopt(M_TOP_PAD, 1 << 28)
 
     os.environ["JAX_ENABLE_X64"] = "0"  # everything here is float32
+    if "jax" in sys.modules:  # a world or method of a user was imported with it
+        sys.modules["jax"].config.update("jax_enable_x64", False)
     # jax reads these when it is imported, which is after a command has found nothing wrong.
     cache = cache_folder()
+    try:
+        os.makedirs(cache, exist_ok=True)
+    except OSError as error:
+        print(f"compiled programs are not kept: {cache}: {error.strerror}", file=sys.stderr)
+        return
+    warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation")
     os.environ["JAX_COMPILATION_CACHE_DIR"] = cache
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.5"
     if "jax" in sys.modules:  # a world or method of a user was imported with it
         import jax
 
-        jax.config.update("jax_enable_x64", False)
         jax.config.update("jax_compilation_cache_dir", cache)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
@@ -100,7 +107,7 @@ def run(
     """
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words
-    _make_sturdy()
+    _make_sturdy(debug)
     config = None
     try:
         with signals.watched():
@@ -122,14 +129,16 @@ def run(
     sys.exit(0)
 
 
-def _make_sturdy() -> None:
+def _make_sturdy(debug: bool) -> None:
     """Let no output and no other thread spoil a command: what cannot be printed is escaped, and an error
-    in a thread is reported by the main thread alone, which meets it as well."""
+    in a thread or a destructor is reported by the main thread alone, which meets it as well."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
-    if "--debug" not in sys.argv:
+    if not debug and threading.excepthook is threading.__excepthook__:
         threading.excepthook = lambda args: None
+    if not debug and sys.unraisablehook is sys.__unraisablehook__:
+        sys.unraisablehook = lambda args: None
 
 
 def say(text: str) -> None:

@@ -20,7 +20,7 @@ from envs.episodes import run_episode
 from envs.registry import World
 from experiments.datasets import find_demonstrator, prepare_dataset
 from experiments.figures import training_curve
-from experiments.signals import Stopped, asked_to_stop
+from experiments.signals import Stopped, asked_to_stop, farewell
 from experiments.store import runs
 from experiments.store.metrics import Metrics, check_loggers
 from experiments.store.provenance import provenance
@@ -123,13 +123,13 @@ class Run:
     Its folder is claimed, so that no other process works in it.
     """
 
-    def __init__(self, config: PretrainConfig) -> None:
+    def __init__(self, config: PretrainConfig, go_on: str) -> None:
         self.config, self.folder = config, config.folder
         world, env = envs.find(config.env), envs.make(config.env)
         network_config(env.spec, config.head, encoder=config.encoder)  # complains about a bad one
         check_loggers(config)
         meta = provenance()
-        dataset, place, sha256 = prepare_dataset(config, world, env)
+        dataset, place, sha256 = prepare_dataset(config, world, env, go_on)
         self.network = configured_network(config, env, dataset)
         self.mesh = device_mesh(largest_divisor(config.train.part_size, len(jax.devices())))
         cut = len(dataset) - config.holdout
@@ -189,9 +189,10 @@ def train(config: PretrainConfig, go_on: str = "continue with --resume") -> None
       Stopped: if it was asked to stop; the state is saved.
       DataError: if a loss, weight or return is not finite; the last sound checkpoint is kept.
     """
-    with claimed(config.folder):
-        remove_unfinished(config.folder)
-        run = Run(config)
+    folder = config.folder
+    with claimed(folder), farewell(lambda: f"stopped; {go_on}" if runs.has_begun(folder) else ""):
+        remove_unfinished(folder)
+        run = Run(config, go_on)
         with checkpoints(run.folder / runs.CHECKPOINTS) as manager:
             blank = run.trainer.init()
             before = restore_state(manager, blank, run.identity) if config.resume else None

@@ -57,15 +57,26 @@ def checkpoints(folder: Path, keep: int = 2) -> Iterator[ocp.CheckpointManager]:
     options = ocp.CheckpointManagerOptions(
         max_to_keep=keep, create=True, enable_async_checkpointing=False
     )
-    logger = logging.getLogger("absl")
-    level = logger.level
-    logger.setLevel(logging.CRITICAL)  # what matters of Orbax's warnings is said here, in one line
-    manager = ocp.CheckpointManager(folder, options=options)
+    with _quiet("absl", "asyncio"):
+        manager = ocp.CheckpointManager(folder, options=options)
+        try:
+            yield manager
+        finally:
+            manager.close()
+
+
+@contextmanager
+def _quiet(*names: str) -> Iterator[None]:
+    """Silence loggers: what matters of their warnings is raised as well, and said here in one line."""
+    loggers = [logging.getLogger(name) for name in names]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL + 1)
     try:
-        yield manager
+        yield
     finally:
-        manager.close()
-        logger.setLevel(level)
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
 
 
 def save_state(manager: ocp.CheckpointManager, snapshot: Snapshot, identity: str = "") -> None:

@@ -23,6 +23,7 @@ except ImportError:  # Windows, where folders are not claimed
     fcntl = None  # type: ignore[assignment]
 
 LOCK = ".lock"
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT)  # of a disk that is full
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # of some network file systems
 _ON_EXIT: list[Callable[[], None]] = []
 
@@ -67,7 +68,7 @@ def claimed(folder: Path, wait: bool = False) -> Iterator[None]:
       UsageError: if nothing can be written there.
     """
     if not os.path.exists(folder):
-        check_place(folder)
+        check_place(folder, num_bytes=0)
     made = [above for above in folder.absolute().parents if not above.exists()]
     descriptor = None
     while descriptor is None:
@@ -90,6 +91,8 @@ def _try_to_hold(folder: Path, wait: bool) -> int | None:
             return None  # removed between the two calls by the process that held it
         raise cannot_write(folder, "no such place") from None
     except OSError as error:
+        if error.errno in NO_ROOM:
+            raise  # that is no fault of the request
         raise cannot_write(folder, error.strerror) from None
     try:
         _lock(descriptor, folder, wait)

@@ -15,14 +15,14 @@ import os
 import secrets
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from envs.errors import DataError
-from mgpo_jax.claims import LOCK, claimed, cleaned_on_exit
+from mgpo_jax.claims import LOCK, InUseError, claimed, cleaned_on_exit
 
 TEMPORARY = ".writing-"  # how the names of files begin that are being written
 
@@ -138,6 +138,14 @@ def new_folder(folder: Path, keep: str = "", wait: bool = False) -> Iterator[Pat
             raise
         flush_folder(folder.parent)
         _clear(partial)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what is left of making a folder that is there, if a kill came right after it was."""
+    partial = partial_name(folder)
+    if os.path.isdir(folder) and os.path.isdir(partial):
+        with suppress(InUseError), claimed(partial):
+            _clear(partial)
 
 
 class ExistsError(DataError):

@@ -148,6 +148,9 @@ class _Document(BaseModel):
     made: dict[str, Json]
 
 
+SIZES = ("embed_dim", "num_layers", "num_heads", "max_prompt_length")  # never left to a default
+
+
 class _Made(BaseModel):
     """What is known of the entries of ``made``; there may be others."""
 
@@ -176,6 +179,8 @@ def _read_config(folder: Path) -> _Config:
     if document.format == 1 and "obs_dim" in network:
         network = {**network, "obs_shape": [network["obs_dim"]]}
         del network["obs_dim"]
+    if missing := [name for name in SIZES if name not in network]:
+        raise DataError(f"{path} lacks network.{missing[0]}; {MEND}")
     config = checked_entry(network, TransformerConfig, path, "network", MEND)
     checked_entry(document.made, _Made, path, "made", MEND)
     if said := _fault(config):

@@ -146,7 +146,8 @@ class TrainConfig:
     """Largest standard deviation of the Gaussian noise that training adds to observations, in their
     units [0]."""
     part_size: BatchSize = 16
-    """Trajectories computed at once, over all devices. It changes speed and memory, not the sum."""
+    """Trajectories of nearly equal length that are computed at once, over all devices. A batch mixes as many
+    lengths as it has such parts."""
     part_steps: Count = 1024
     """Parts with more padded steps than this are halved, so that they fit into a core's cache."""
     bucket: BatchSize = 4

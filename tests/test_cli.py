@@ -371,8 +371,7 @@ def test_a_folder_in_which_no_run_has_begun_is_started_in(
         (fresh / name).write_text("")
     code, text = command(f"{TINY} --out fresh {line}")
     assert code == 0, text
-    left = {path.name for path in fresh.iterdir()} - {path.name for path in RUN.iterdir()}
-    assert left == {"config.json.partial"}
+    assert {path.name for path in fresh.iterdir()} == {path.name for path in RUN.iterdir()}
 
 
 def test_a_folder_with_other_files_is_left_alone(command: Run, workspace: Path) -> None:

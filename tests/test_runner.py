@@ -176,7 +176,7 @@ def test_a_world_may_ask_for_company():
     alone = lanes_together(MAZE, memory)
     assert lanes_together(InGroups(MAZE, 1), memory) == alone
     assert lanes_together(InGroups(MAZE, alone + 5), memory) == alone + 5
-    assert _lay_out(InGroups(MAZE, 1000), 60, memory).group == 30  # two devices
+    assert _lay_out(InGroups(MAZE, 1000), 60, memory).group == 60 // jax.device_count()
 
 
 def test_groups_are_as_large_as_what_their_agents_remember():

@@ -377,6 +377,7 @@ def load_results(folder: Path, parts: Collection[str] = PARTS) -> Results:
     config = read_config(folder)
     _check_format(folder / META)
     arrays = _read_parts(folder / ARRAYS, config, parts)
+    _check_actions(arrays.get("actions"), folder / ARRAYS)
     num_tasks = arrays["returns"].shape[1]
     optimum = arrays.get("optimal_returns")
     results = Results(
@@ -398,6 +399,15 @@ def load_results(folder: Path, parts: Collection[str] = PARTS) -> Results:
     if "task_goals" in arrays:
         vars(results)["task_goals"] = arrays["task_goals"]  # saves making the world
     return results
+
+
+def _check_actions(actions: np.ndarray | None, path: Path) -> None:
+    """Raise ``DataError`` for actions of the wrong number of axes: discrete ones are single integers."""
+    if actions is not None and actions.ndim != (5 if actions.dtype.kind == "f" else 4):
+        raise DataError(
+            f"{path}: actions has shape {list(actions.shape)} of {actions.dtype}, wanted [seed, task, "
+            f"episode, step] integers or one axis more of floats; {ADAPT_AGAIN}"
+        )
 
 
 def _read_tasks(path: Path, num: int) -> dict[str, np.ndarray]:

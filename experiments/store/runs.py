@@ -21,9 +21,8 @@ from mgpo_jax.files import TEMPORARY, write_json
 from mgpo_jax.schema import read_document
 
 CONFIG, META, CHECKPOINTS, POLICY = "config.json", "meta.json", "checkpoints", "policy"
-ROOM = (
-    32 << 20
-)  # bytes that must be free before a training starts: a few checkpoints of a small network
+OLD_PARTIAL = "config.json.partial"  # what older versions were writing when they were killed
+ROOM = 32 << 20  # bytes that must be free before a training starts: a few small checkpoints
 
 
 def has_begun(folder: Path) -> bool:
@@ -57,7 +56,7 @@ def check_start(config: PretrainConfig) -> None:
 
 def _holds_nothing(folder: Path) -> bool:
     """Whether a folder has only what a run leaves that was killed before it began."""
-    own = (LOCK, META, f"{CONFIG}.partial")
+    own = (LOCK, META, OLD_PARTIAL)
     return folder.is_dir() and all(
         path.name in own or path.name.startswith(TEMPORARY) for path in folder.iterdir()
     )
@@ -71,6 +70,7 @@ def identity(config: PretrainConfig, dataset_sha256: str) -> str:
 
 def begin(config: PretrainConfig, meta: dict[str, Any]) -> None:
     """Note what a new run is."""
+    (config.folder / OLD_PARTIAL).unlink(missing_ok=True)
     write_json(config.folder / META, meta)
     write_json(config.folder / CONFIG, config)
 

@@ -30,6 +30,7 @@ def long_work(
     meta: Mapping[str, Any],
     resume: bool,
     wait: bool = False,
+    go_on: str = "continue with --resume",
 ) -> Iterator[tuple[Path, Journal]]:
     """A place to write the result to, and a journal of finished pieces.
 
@@ -39,6 +40,7 @@ def long_work(
       meta: how and with what this process works, of ``provenance``.
       resume: whether to go on with what a stopped process has finished.
       wait: wait for another process that makes the same folder.
+      go_on: what continues the work after a stop, for messages.
 
     Raises:
       DataError: if ``folder`` exists, or another process makes it.
@@ -55,7 +57,7 @@ def long_work(
             print(f"going on with the unfinished work in {pieces.parent}", file=sys.stderr)
         journal = Journal(pieces)
         write_json(pieces / SETTINGS, {"settings": settings, "meta": meta})
-        with farewell(lambda: _farewell(pieces)):
+        with farewell(lambda: _farewell(pieces, go_on)):
             yield place, journal
 
 
@@ -81,7 +83,7 @@ def _check_same(pieces: Path, settings: Mapping[str, Any], meta: Mapping[str, An
         say_what_differs(saved["meta"], dict(meta), str(pieces.parent))
 
 
-def _farewell(pieces: Path) -> str:
+def _farewell(pieces: Path, go_on: str) -> str:
     if has_work(pieces):
-        return f"stopped; what is finished is in {pieces.parent}, continue with --resume"
+        return f"stopped; what is finished is in {pieces.parent}, {go_on}"
     return "stopped before anything was finished; nothing was written"
