@@ -30,6 +30,7 @@ import mujoco  # noqa: E402
 
 HORIZON = 500
 WORLD = Kitchen(name="kitchen", horizon=HORIZON)
+NATIVE = Kitchen(name="kitchen", horizon=HORIZON, backend="native")  # WORLD is MJX on a GPU
 MJX = Kitchen(name="kitchen-mjx", horizon=HORIZON, backend="mjx")
 STOCK = Kitchen(name="stock", horizon=HORIZON, model="stock")
 NUM_TASKS = 325
@@ -271,7 +272,7 @@ class TestBadInput:
             extra.check_extra()
 
     @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-    @pytest.mark.parametrize("env", [WORLD, pytest.param(MJX, marks=pytest.mark.slow)])
+    @pytest.mark.parametrize("env", [NATIVE, pytest.param(MJX, marks=pytest.mark.slow)])
     def test_an_action_that_is_no_number_ends_its_own_episode(self, env, bad):
         step_many = many_stepper(env)
         states = jax.vmap(lambda _: begin([LIGHT], env))(jnp.arange(4))
@@ -285,7 +286,7 @@ class TestBadInput:
             np.testing.assert_array_equal(one[:2], other[:2])
 
     @pytest.mark.parametrize("speed", [1e5, 1e15, 1e30])
-    @pytest.mark.parametrize("env", [WORLD, pytest.param(MJX, marks=pytest.mark.slow)])
+    @pytest.mark.parametrize("env", [NATIVE, pytest.param(MJX, marks=pytest.mark.slow)])
     def test_a_diverged_world_ends_its_own_episode(self, env, speed):
         num = 20  # enough for several threads
         step_many = many_stepper(env)
@@ -378,7 +379,7 @@ class TestNative:
             np.testing.assert_allclose(sharded(actions), expected, atol=1e-5)
 
     def test_threads_share_it(self):
-        stepper = WORLD.physics  # loads the model once, before the threads
+        stepper = NATIVE.physics  # loads the model once, before the threads
         state = jax.tree.map(jnp.asarray, stepper.initial)
         advance = jax.jit(jax.vmap(partial(stepper.advance, state, active=jnp.array(True))))
         targets = state.qpos[:9] + 0.1 * jnp.asarray(random_actions(2, 8, 16))
@@ -438,7 +439,7 @@ def test_one_step_of_mjx_is_one_of_native():
         jit_for(env)(
             jax.vmap(lambda action, env=env: env.step(begin([LIGHT], env), action)[1].obs)
         )(actions)
-        for env in (WORLD, MJX)
+        for env in (NATIVE, MJX)
     ]
     np.testing.assert_allclose(*after, atol=5e-3)
     assert np.median(np.abs(after[0] - after[1])) < 1e-5
@@ -446,11 +447,10 @@ def test_one_step_of_mjx_is_one_of_native():
 
 def test_accelerators_call_c_through_a_pure_callback(monkeypatch):
     state, action = begin([LIGHT]), jnp.asarray(random_actions(6))
-    expected, _ = stepper(WORLD)(state, action)
+    expected, _ = stepper(NATIVE)(state, action)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    found, _ = jax.jit(Kitchen(name="kitchen", horizon=HORIZON, backend="native").step)(
-        state, action
-    )
+    again = Kitchen(name="traced anew", horizon=HORIZON, backend="native")
+    found, _ = jax.jit(again.step)(state, action)
     for one, other in zip(found.physics, expected.physics, strict=True):
         np.testing.assert_array_equal(one, other)
 

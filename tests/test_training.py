@@ -269,6 +269,7 @@ def test_noise_is_finite_and_not_negative(size):
         Trainer(replace(CONFIG, obs_noise=size), NETWORK, DATASET, device_mesh(1))
 
 
+@pytest.mark.skipif(jax.device_count() < 2, reason="needs two devices")
 def test_devices_must_divide_the_parts():
     with pytest.raises(UsageError, match="part_size 3 does not divide over 2 devices"):
         Trainer(replace(CONFIG, part_size=3), NETWORK, DATASET, device_mesh(2))

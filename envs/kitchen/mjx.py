@@ -43,7 +43,8 @@ def mjx_physics(
         def substep(state: PhysicsState, _: None) -> tuple[PhysicsState, None]:
             qpos, qvel, warmstart = state
             data = blank.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=ctrl)
-            data = mjx.step(model, data)
+            with jax.default_matmul_precision("highest"):  # else GPUs round factors to 10 bits
+                data = mjx.step(model, data)
             after = PhysicsState(qpos=data.qpos, qvel=data.qvel, warmstart=data.qacc_warmstart)
             return after, None
 
