@@ -1,0 +1,1 @@
+"""Speed in wall time on an accelerator."""
