@@ -27,10 +27,7 @@ def _leave_quietly() -> None:
     A KeyboardInterrupt in the middle of an import can be swallowed, or leave the interpreter crashing.
     """
     started = Path(sys.argv[0]).name if sys.argv else ""
-    as_command = started in (
-        "-m",
-        "mgpo",
-    )  # ``python -m`` calls itself so until the module is found
+    as_command = started in ("-m", "mgpo")  # argv[0] is "-m" until ``python -m`` finds the module
     if as_command and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, lambda number, frame: os._exit(128 + number))
 

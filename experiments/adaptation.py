@@ -67,19 +67,20 @@ def adapt_all(
 
 
 NO_SETTINGS = ("debug", "figures", "out", "policy", "resume", "tasks")
-"""Settings of the command that do not decide about its results, or whose content is hashed instead."""
+"""Settings of the command that do not change its results, or that stand for files whose hash counts."""
 
 
 def deciding(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a command that decide about its results."""
+    """The settings of a command that determine its results."""
     return {name: value for name, value in config.items() if name not in NO_SETTINGS}
 
 
 def finished(folder: Path, config: AdaptConfig, policy: LoadedPolicy) -> Results:
-    """The results of an adaptation that ended before it was resumed.
+    """The results of an adaptation that was finished before it was resumed.
 
     Raises:
       UsageError: if they are of other settings.
+      DataError: if they are damaged, or of other weights.
     """
     remove_leftovers(folder)
     results = load_results(folder)
@@ -97,7 +98,12 @@ def adapt_and_save(
     policy: LoadedPolicy,
     tasks: Task,
 ) -> Results:
-    """Adapt to all tasks as an ``AdaptConfig`` says, and write the results to a new folder."""
+    """Adapt to all tasks as an ``AdaptConfig`` says, and write the results to a new folder.
+
+    Raises:
+      UsageError: if there is unfinished work of other settings, or none was asked to be resumed.
+      DataError: if the folder exists, another process makes it, or a return is not finite.
+    """
     settings = deciding(to_json(config))
     settings["policy_sha256"] = policy.sha256
     settings["tasks_sha256"] = hash_arrays(task_arrays(tasks))

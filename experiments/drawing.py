@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +72,7 @@ def pictures_together(
         for result in results.values():
             result.task_set  # noqa: B018 (read and checked before anything is written)
         which = tasks or first.most_improved()
-        players = lambda result: player_of(result, policy)  # noqa: E731
+        players = partial(player_of, policy_folder=policy)
         drawn += figures_of_results(pictures, results, players, which, seed)
     return [(f"{file_name(first.env)}_{name}", save) for name, save in drawn]
 

@@ -66,6 +66,10 @@ def open_case(
       env_name: the world to evaluate in (default: where the prompts were found).
       sizes: the noises.
       policy: folder of the policy (default: where it lay when the results were made).
+
+    Raises:
+      UsageError: if the method has no prompts, or the world cannot run the tasks or has no such noise.
+      DataError: if the results are damaged, or the policy is missing or does not fit.
     """
     if env_name is not None:
         envs.find(env_name)  # from now on results may name its place

@@ -1,11 +1,11 @@
 """Command lines as checked settings. tyro alone decides what the words mean.
 
 Defaults may depend on other flags, as those of ``pretrain`` do on ``--env``. So a command line is parsed
-twice by the same parser: once with the general defaults, from which the others are chosen, and once with
-those. No flag may be given twice, so both times have the same values.
+twice by the same parser: once with the general defaults, to see which other ones it chooses, and once with
+those. No flag may be given twice, so both passes read the same values.
 
-tyro takes numbers and choices as they were typed, and before it makes settings of them, the check that
-library calls go through as well says what is wrong with one.
+Numbers and choices pass through tyro as they were typed. Before settings are made of them, they go through
+the same check as those of library calls, which says what is wrong.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from envs.errors import UsageError, shown
 from mgpo_jax.settings import check_values, flag, is_settings, range_of, types_of
 
 Defaults = Callable[[Any, Sequence[str]], Any]
-"""``(config, flags) -> default config``: the defaults that a config chooses, which has the general ones
-where nothing was typed. ``flags`` are those on the command line that the config does not have."""
+"""``(config, flags) -> default config``. The config has what was typed, and general defaults elsewhere.
+``flags`` are those on the command line that it does not know."""
 
 
 def parse(
@@ -73,7 +73,7 @@ def parse(
     known = _flags(config)
     _check_flags(words, known)
     flags = itertools.takewhile(lambda word: word != "--", words)
-    # tyro takes a flag with odd characters for a word of its own
+    # tyro takes a flag with odd characters for a positional word.
     strange = [word for word in flags if word.startswith("--") and _flag_of(word) not in known]
     if unknown or strange:
         _refuse_unknown(unknown or strange, list(known), prog)
@@ -81,7 +81,7 @@ def parse(
 
 
 class _Refused(Exception):
-    """A value is refused. tyro has an answer of its own to a ValueError, such as UsageError is."""
+    """A value is refused. (A ``UsageError`` is a ``ValueError``, which tyro would catch and reword.)"""
 
 
 def _read(words: list[str], config_class: type, prog: str, **options: Any) -> tuple[Any, list[str]]:
@@ -213,7 +213,7 @@ def _registry() -> ConstructorRegistry:
 
 
 def _checked(settings_class: type, make: Callable[..., Any], **values: Any) -> Any:
-    """What ``make`` makes of values that are right."""
+    """The settings that ``make`` makes of the values, if they are right; else raise ``_Refused``."""
     try:
         check_values(settings_class, values)
     except UsageError as error:
@@ -232,7 +232,7 @@ def _with_range(field: StructFieldSpec) -> StructFieldSpec:
 
 
 def _number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    """A number, or the text that was typed where it is none."""
+    """How tyro reads a number. Text that is no number stays text, for the check to refuse."""
     if info.type not in (int, float):
         return None
     kind = info.type
@@ -255,7 +255,7 @@ def _number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
 
 
 def _choice(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    """One of several words, or another one that was typed."""
+    """How tyro reads one of several words. Any other word is kept, for the check to refuse."""
     if info.type_origin is not Literal:
         return None
     choices = get_args(info.type)

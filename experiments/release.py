@@ -17,6 +17,7 @@ import tyro
 from envs.errors import UsageError
 from experiments.runtime import Common, refuse_existing, run
 from experiments.store.runs import is_finished
+from mgpo_jax.settings import Name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +28,7 @@ class ReleaseConfig(Common):
     """Folder of a finished pre-training run."""
     out: Path | None = None
     """Folder to write (default: mgpo_jax/pretrained/ENV)."""
-    env: str | None = None
+    env: Name | None = None
     """The world of the run, as module:attribute where it has no registered name."""
 
 

@@ -71,7 +71,7 @@ def configure() -> None:
     warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation")
     os.environ["JAX_COMPILATION_CACHE_DIR"] = cache
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.5"
-    if "jax" in sys.modules:  # a world or method of a user was imported with it
+    if "jax" in sys.modules:  # as above
         import jax
 
         jax.config.update("jax_compilation_cache_dir", cache)
@@ -130,8 +130,11 @@ def run(
 
 
 def _make_sturdy(debug: bool) -> None:
-    """Let no output and no other thread spoil a command: what cannot be printed is escaped, and an error
-    in a thread or a destructor is reported by the main thread alone, which meets it as well."""
+    """Keep a command going whatever it prints, and leave the report of errors to the main thread.
+
+    Characters that a stream cannot print are escaped. An error in another thread or in a destructor is not
+    printed, since the main thread meets it as well.
+    """
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")

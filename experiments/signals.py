@@ -60,7 +60,7 @@ def _say(text: str) -> None:
 
 
 def leave(number: int) -> None:
-    """Clean up and end the process, whatever it is doing."""
+    """Clean up and end the process, whatever it is doing, with 128 plus the signal's number."""
     from mgpo_jax.claims import clean_up
 
     clean_up()
@@ -105,8 +105,10 @@ def _listen(reading: int) -> None:
 
 @contextmanager
 def asked_to_stop() -> Iterator[Callable[[], int]]:
-    """Lets the block stop at a time of its choice: gives a function that tells the number of the signal
-    that asks for it, or 0."""
+    """Let the block choose when to stop.
+
+    It gets a function that returns the number of the signal that asks it to stop, or 0 if none came.
+    """
     _watch.patient = True
     try:
         yield lambda: _watch.asked[0] if _watch.asked else 0
@@ -116,7 +118,7 @@ def asked_to_stop() -> Iterator[Callable[[], int]]:
 
 @contextmanager
 def farewell(text: Callable[[], str]) -> Iterator[None]:
-    """What is said when the block is left at once."""
+    """Print ``text()`` on stderr, unless it is empty, if a signal ends the process within the block."""
     before, _watch.farewell = _watch.farewell, text
     try:
         yield

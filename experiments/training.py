@@ -118,9 +118,9 @@ class GreedyEvaluation:
 
 
 class Run:
-    """A training under way: the trainer, what measures it, and where its metrics go.
+    """A training under way: its data, its trainer and what measures it.
 
-    Its folder is claimed, so that no other process works in it.
+    Whoever makes it holds the claim on its folder, where it notes the settings of a run that begins.
     """
 
     def __init__(self, config: PretrainConfig, go_on: str) -> None:

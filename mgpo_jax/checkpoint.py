@@ -115,7 +115,7 @@ def restore_state(
             _check_hash(found)
         except Exception:  # Orbax raises many kinds for a damaged file
             _set_aside(where, root.with_name(root.name + DAMAGED))
-            manager.reload()  # or it would save no step up to the one that is gone
+            manager.reload()  # else it refuses to save steps up to the one that is gone
             continue
         if identity and _IDENTITY in found and found[_IDENTITY].tobytes().hex() != identity:
             raise DataError(

@@ -7,6 +7,7 @@ process ends, so that nothing has to be cleaned up by hand.
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import shutil
 import socket
@@ -16,11 +17,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from envs.errors import DataError, UsageError, printable
-
-try:
-    import fcntl
-except ImportError:  # Windows, where folders are not claimed
-    fcntl = None  # type: ignore[assignment]
 
 LOCK = ".lock"
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)  # of a disk that is full
@@ -49,6 +45,7 @@ class Claim:
                     folder.rmdir()  # only an empty folder can be removed
 
     def close(self) -> None:
+        """Let go of the folder."""
         self.leave()
         os.close(self._descriptor)
 
@@ -108,8 +105,6 @@ def _try_to_hold(folder: Path, wait: bool) -> int | None:
 
 
 def _lock(descriptor: int, folder: Path, wait: bool) -> None:
-    if fcntl is None:
-        return
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -135,6 +130,7 @@ def _is_at(path: Path, descriptor: int) -> bool:
 
 
 def cannot_write(folder: Path, reason: str | None) -> UsageError:
+    """The error for a folder in which nothing can be written."""
     return UsageError(f"cannot write to {folder} ({reason}); choose another place with --out")
 
 
@@ -170,7 +166,7 @@ def check_place(path: Path, flag: str = "--out", num_bytes: int = 1 << 20) -> No
 
 @contextmanager
 def cleaned_on_exit(clean: Callable[[], None]) -> Iterator[None]:
-    """Note what cleans up behind the block if the process is asked to leave at once."""
+    """Call ``clean`` if a signal ends the process within the block."""
     _ON_EXIT.append(clean)
     try:
         yield
@@ -179,7 +175,7 @@ def cleaned_on_exit(clean: Callable[[], None]) -> Iterator[None]:
 
 
 def clean_up() -> None:
-    """Clean up behind everything that is under way, the last begun first."""
+    """Call what the blocks under way have noted (``cleaned_on_exit``), the innermost first."""
     for clean in reversed(_ON_EXIT):
         with suppress(OSError):
             clean()

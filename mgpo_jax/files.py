@@ -141,7 +141,7 @@ def new_folder(folder: Path, keep: str = "", wait: bool = False) -> Iterator[Pat
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove what is left of making a folder that is there, if a kill came right after it was."""
+    """Remove what a process left beside a finished folder, if it was killed right after making it."""
     partial = partial_name(folder)
     if os.path.isdir(folder) and os.path.isdir(partial):
         with suppress(InUseError), claimed(partial):
@@ -153,6 +153,7 @@ class ExistsError(DataError):
 
 
 def exists_already(folder: Path) -> ExistsError:
+    """The error for a folder that exists."""
     return ExistsError(f"{folder} exists already; remove it or choose another place with --out")
 
 

@@ -49,7 +49,7 @@ DTYPES = (
     "bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64",
     "float16", "float32", "float64",
 )  # fmt: skip
-"""Of observations."""
+"""The dtypes that observations may have."""
 
 
 def save_policy(folder: Path, config: TransformerConfig, params: Any, made: dict[str, Any]) -> None:

@@ -63,6 +63,7 @@ class Progress:
         self.close()
 
     def close(self) -> None:
+        """End the bar, which leaves its last state on the terminal."""
         self._bar.close()
 
 

@@ -347,6 +347,7 @@ class Program:
         self._compiled: dict[Any, Any] = {}
 
     def compile(self, *args: Any) -> Any:
+        """The program for arguments of these shapes."""
         shapes, tree = jax.tree.flatten(jax.tree.map(jax.typeof, args))
         where = (tuple(shapes), tree)
         if where not in self._compiled:
@@ -521,8 +522,10 @@ def _keep(journal: Journal, number: int, segment: Segment, state: Any, grid: Gri
 def _resumed(
     journal: Journal, grid: Grid, layout: Layout, state: Any, shapes: tuple[Any, Any]
 ) -> tuple[list[Segment], Any]:
-    """The finished segments in a journal and the state after them; none, and the first state, if any of
-    them is missing."""
+    """The finished segments in a journal and the state after them.
+
+    If any of them is missing, there are none, and the state is the first one.
+    """
     saved = journal.read("state")
     if saved is None:
         return [], state
@@ -531,9 +534,8 @@ def _resumed(
     done = [with_leaves(like, record) for record in records if record is not None]
     if len(done) < len(records):
         return [], state
-    index = (
-        np.arange(layout.num_lanes) % grid.size
-    )  # the lanes beyond the grid repeat the first ones
+    # The lanes beyond the grid repeat the first ones.
+    index = np.arange(layout.num_lanes) % grid.size
 
     def placed(rows: Any, like: Any) -> Any:
         rows = jnp.asarray(rows[index])

@@ -5,9 +5,9 @@ A dataclass declares what is allowed in settings and JSON files: the type of a f
 number, ``"1"`` is no integer, and NaN and infinity are never allowed.
 
 ``ArrayField`` declares an array of an npz file: its axes, its kind of numbers and their range.
-``read_arrays`` is the only reader of such files. It compares what the headers claim with what is declared
-and with the size of the file before it takes any memory, runs nothing that a file holds, and converts what
-is valid but foreign, such as big-endian numbers.
+``read_arrays`` reads all such files but those of ``journal``, which hold their own hash. It compares what
+the headers claim with what is declared and with the size of the file before it allocates any memory, runs
+nothing that a file holds, and converts what is valid but foreign, such as big-endian numbers.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ _WORDS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
     "string_type": lambda limits: "must be text",
     "is_instance_of": lambda limits: f"must be a {limits['class']}",
     "none_required": lambda limits: "must be null",
-    "string_pattern_mismatch": lambda limits: "is none that can stand here",
+    "string_pattern_mismatch": lambda limits: "is not a name that is allowed here",
     "string_too_long": lambda limits: f"must have at most {limits['max_length']} characters",
     "too_long": lambda limits: f"must have at most {limits['max_length']} entries",
     "too_short": lambda limits: f"must have at least {limits['min_length']} entries",
@@ -172,7 +172,7 @@ def read_text(path: Path, mend: str = "") -> bytes:
     """The bytes of a small text file.
 
     Raises:
-      DataError: if it is missing, no file or too large.
+      DataError: if it is missing, no file, too large or cannot be read.
     """
     tail = _tail(mend)
     try:

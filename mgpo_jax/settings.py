@@ -75,7 +75,10 @@ def check_settings(settings: Any) -> None:
 
 
 def check_values(settings_class: type, values: Mapping[str, Any]) -> None:
-    """The same for values that a dataclass is to be made of, but for other dataclasses among them."""
+    """Raise ``UsageError`` for the first value that a dataclass of settings must not be made of.
+
+    Values that are dataclasses of settings themselves are not checked.
+    """
     known = types_of(settings_class)
     for name, value in values.items():
         annotation = known.get(name, type(value))
@@ -146,8 +149,8 @@ class TrainConfig:
     """Largest standard deviation of the Gaussian noise that training adds to observations, in their
     units [0]."""
     part_size: BatchSize = 16
-    """Trajectories of nearly equal length that are computed at once, over all devices. A batch mixes as many
-    lengths as it has such parts."""
+    """Trajectories of nearly equal length that are computed at once, over all devices. A batch mixes as
+    many lengths as it has such parts."""
     part_steps: Count = 1024
     """Parts with more padded steps than this are halved, so that they fit into a core's cache."""
     bucket: BatchSize = 4

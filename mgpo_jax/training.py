@@ -306,8 +306,8 @@ class Trainer:
 
     def init(self) -> TrainState:
         """The state before the first step."""
-        # Op by op these are 160 programs, which a GPU compiles one after the other. As one program each
-        # they round differently; on CPUs a seed gives the same digits as before.
+        # A GPU would compile 160 small programs one after the other, so it gets two large ones. They round
+        # differently: on CPUs, where the published policies were trained, the small ones are kept.
         compiled = (lambda function: function) if jax.default_backend() == "cpu" else jax.jit
         params = compiled(self._initial_params)()
         return TrainState(params, compiled(self._optimizer.init)(self._flatten(params)), 0)
@@ -354,6 +354,7 @@ def finite_metrics(step: int, metrics: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def diverged(step: int, metric: str, value: Any) -> DataError:
+    """The error for a training in which a metric is not finite after a step."""
     return DataError(
         f"training stopped at step {step}: {metric} became {value}; use a lower --learning-rate or "
         "a lower --clip-norm"

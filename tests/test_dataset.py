@@ -270,7 +270,10 @@ FILE_DAMAGE = {
         lambda f: sign(f, num_steps=1),
         r"obs has shape \[17, 2\], wanted \[step 1, 2\]; .*collect it again",
     ),
-    "a path for a world": (lambda f: sign(f, env="../../x"), "env is none that can stand here"),
+    "a path for a world": (
+        lambda f: sign(f, env="../../x"),
+        "env is not a name that is allowed here",
+    ),
     "a seed in words": (lambda f: sign(f, seed="seven"), "seed must be an integer, found 'seven'"),
     "NaN among the facts": (
         lambda f: sign(f, at_horizon=float("nan")),

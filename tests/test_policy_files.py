@@ -127,7 +127,10 @@ def test_damaged_network_settings(policy: Path, change: dict, says: str) -> None
         ({"network": [1]}, "config.json: network must be an object"),
         ({"network": None}, "config.json: network must be an object, found None"),
         ({"made": 7}, "config.json: made must be an object, found 7"),
-        ({"made": {"env": "../../x"}}, r"made.env is none that can stand here, found '../../x'"),
+        (
+            {"made": {"env": "../../x"}},
+            r"made.env is not a name that is allowed here, found '../../x'",
+        ),
         ({"made": {"steps": 1.5}}, r"made.steps must be an integer, found 1.5"),
         ({"sha256": "0"}, "config.json: sha256 is none"),
         ({"more": 1}, "has the unknown entry more"),

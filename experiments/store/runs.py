@@ -1,8 +1,8 @@
-"""The folder of a pre-training run: when it may be started in, and what a resumed run must agree on.
+"""The folder of a pre-training run: when a run may start there, and what a resumed run must agree on.
 
-It holds ``config.json`` (the settings, written last of what a start writes, so that a run has begun where
-it is there), ``meta.json`` (how and with what it was made), ``metrics.jsonl``, ``checkpoints`` and, when it
-is finished, ``policy`` and ``training.png``. Nothing here imports jax.
+It holds ``config.json`` (the settings), ``meta.json`` (how and with what it was made), ``metrics.jsonl``,
+``checkpoints`` and, when it is finished, ``policy`` and ``training.png``. A run has begun where there is a
+``config.json``: a start writes it last. Nothing here imports jax.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from envs.errors import DataError, UsageError, shown
 from experiments.store.settings import PretrainConfig, saved_pretraining, training_settings
 from mgpo_jax.claims import LOCK, check_place
 from mgpo_jax.files import TEMPORARY, write_json
-from mgpo_jax.schema import read_document
+from mgpo_jax.schema import Json, read_document
 
 CONFIG, META, CHECKPOINTS, POLICY = "config.json", "meta.json", "checkpoints", "policy"
 OLD_PARTIAL = "config.json.partial"  # what older versions were writing when they were killed
@@ -36,7 +37,12 @@ def is_finished(folder: Path) -> bool:
 
 
 def check_start(config: PretrainConfig) -> None:
-    """Raise ``UsageError`` where a run cannot be started, or is there already."""
+    """Check that a run can be started, or resumed where its settings say so.
+
+    Raises:
+      UsageError: if its folder is taken, or nothing can be written there.
+      DataError: if there is a file where its checkpoints should be.
+    """
     folder = config.folder
     if has_begun(folder):
         if not config.resume:
@@ -55,7 +61,7 @@ def check_start(config: PretrainConfig) -> None:
 
 
 def _holds_nothing(folder: Path) -> bool:
-    """Whether a folder has only what a run leaves that was killed before it began."""
+    """Whether a folder holds only what a run leaves behind that was killed before it began."""
     own = (LOCK, META, OLD_PARTIAL)
     return folder.is_dir() and all(
         path.name in own or path.name.startswith(TEMPORARY) for path in folder.iterdir()
@@ -63,7 +69,7 @@ def _holds_nothing(folder: Path) -> bool:
 
 
 def identity(config: PretrainConfig, dataset_sha256: str) -> str:
-    """A hash of everything that decides about the weights of a run, but for the machine."""
+    """A hash of everything that determines the weights of a run, except for the machine."""
     text = json.dumps([training_settings(config), dataset_sha256], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -87,17 +93,16 @@ def check_same(config: PretrainConfig, meta: dict[str, Any]) -> None:
     folder = config.folder
     before = training_settings(saved_pretraining(folder / CONFIG))
     now = training_settings(config)
-    changed = [f"{k} {shown(before[k])} -> {shown(now[k])}" for k in now if now[k] != before[k]]
-    if changed:
+    if changed := changes(before, now):
         raise UsageError(
-            f"{folder} was started with other settings: {'; '.join(changed)}; give the same ones, or start "
-            "a new run with --out"
+            f"{folder} was started with other settings: {changed}; give the same ones, or start a new run "
+            "with --out"
         )
     if not (folder / META).is_file():
         write_json(folder / META, meta)
         return
     saved = read_document(
-        folder / META, dict[str, Any], f"remove {folder / META}, and it is written again"
+        folder / META, dict[str, Json], f"remove {folder / META}, and it is written again"
     )
     hash_before, hash_now = saved.get("dataset_sha256"), meta["dataset_sha256"]
     if hash_before not in (None, hash_now):
@@ -108,8 +113,23 @@ def check_same(config: PretrainConfig, meta: dict[str, Any]) -> None:
     say_what_differs(saved, meta, str(folder))
 
 
+def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """What differs between two sets of settings, in words; empty if nothing does."""
+    return "; ".join(
+        f"{name} {shown(before.get(name))} -> {shown(now.get(name))}"
+        for name in sorted(before.keys() | now.keys())
+        if before.get(name) != now.get(name)
+    )
+
+
 def say_what_differs(saved: dict[str, Any], now: dict[str, Any], what: str) -> None:
-    """A line on stderr if what goes on was begun with other devices or versions."""
+    """Say on stderr if work was begun with another number of devices or with other versions.
+
+    Args:
+      saved: the ``meta.json`` of the work.
+      now: that of this process.
+      what: the work, for the message.
+    """
     differs = []
     if isinstance(saved.get("devices"), list) and len(saved["devices"]) != len(now["devices"]):
         differs.append(f"{len(saved['devices'])} devices (now {len(now['devices'])})")

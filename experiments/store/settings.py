@@ -202,9 +202,8 @@ def pretrain_preset(env: str, preset: str) -> PretrainConfig:
         config = with_settings(config, world.presets.get("fast", {}))
     config = with_settings(config, PRESETS[preset])
     config = with_settings(config, world.presets.get(preset, {}))
-    if (
-        preset == "smoke" and preset not in world.presets
-    ):  # few padded lengths, so that little is compiled
+    if preset == "smoke" and preset not in world.presets:
+        # Few padded lengths, so that little is compiled.
         config = with_settings(config, {"bucket": 8 * config.train.bucket})
     return config
 
@@ -235,11 +234,11 @@ def check_pretraining(config: PretrainConfig) -> None:
 NO_SETTINGS = frozenset(
     {"preset", "out", "resume", "debug", "tb", "wandb", "eval_every", "save_every"}
 )
-"""What a run may be resumed with changed: names, places, and how often and where to it reports."""
+"""Settings that may differ when a run is resumed: they do not change its weights."""
 
 
 def training_settings(config: PretrainConfig) -> dict[str, Any]:
-    """What decides about the result of a training, by the names of its flags, as JSON values."""
+    """The settings that determine the result of a training, by the names of their flags, as JSON values."""
     settings = dataclasses.asdict(config)
     parts = {**settings, **settings["data"], **settings["train"]}
     return {k: v for k, v in parts.items() if k not in NO_SETTINGS | {"data", "train"}}

@@ -76,6 +76,7 @@ class Summary(TypedDict):
 
 
 def method_of(summary: Summary) -> str:
+    """Name or place of the method, also in a summary of an older version."""
     return summary.get("method", summary["optimizer"])
 
 
@@ -177,8 +178,8 @@ def _check_name(registry: Registry, name: str, path: Path) -> None:
 
 
 def check_against(arrays: Path, summary: Summary) -> None:
-    """Raise ``DataError`` if a summary is not of the judged returns in ``results.npz``, or not of one
-    piece."""
+    """Raise ``DataError`` if a summary does not follow from the judged returns in ``results.npz``, or
+    contradicts itself."""
     episodes, returns = _judgements(arrays)
     optimum, solved = summary["optimal_return"], summary["solved_optimally"]
     expected: dict[str, Any] = {

@@ -12,15 +12,26 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from envs.errors import UsageError, shown
+from pydantic import BaseModel
+
+from envs.errors import UsageError
 from experiments.signals import farewell
-from experiments.store.runs import say_what_differs
+from experiments.store.runs import changes, say_what_differs
 from mgpo_jax.files import has_work, new_folder, partial_name, to_json, write_json
 from mgpo_jax.journal import Journal
-from mgpo_jax.schema import read_document
+from mgpo_jax.schema import STRICT, Json, read_document
 
 PIECES = "progress"
 SETTINGS = "settings.json"
+
+
+class _Begun(BaseModel):
+    """``settings.json`` of unfinished work."""
+
+    model_config = STRICT
+
+    settings: dict[str, Json]
+    meta: dict[str, Json]
 
 
 @contextmanager
@@ -63,24 +74,13 @@ def long_work(
 
 def _check_same(pieces: Path, settings: Mapping[str, Any], meta: Mapping[str, Any]) -> None:
     """Raise ``UsageError`` if unfinished work was begun with other settings."""
-    saved = read_document(
-        pieces / SETTINGS, dict[str, Any], f"remove {pieces.parent} and start again"
-    )
-    before, now = saved.get("settings"), to_json(settings)
-    if not isinstance(before, dict):
-        raise UsageError(f"{pieces / SETTINGS} lacks settings; remove {pieces.parent}")
-    changed = [
-        f"{name} {shown(before.get(name))} -> {shown(now.get(name))}"
-        for name in sorted(before.keys() | now.keys())
-        if before.get(name) != now.get(name)
-    ]
-    if changed:
+    mend = f"remove {pieces.parent} and start again"
+    saved: _Begun = read_document(pieces / SETTINGS, _Begun, mend)
+    if changed := changes(saved.settings, to_json(settings)):
         raise UsageError(
-            f"{pieces.parent} was begun with other settings: {'; '.join(changed)}; give the same ones, or "
-            "remove it"
+            f"{pieces.parent} was begun with other settings: {changed}; give the same ones, or remove it"
         )
-    if isinstance(saved.get("meta"), dict):
-        say_what_differs(saved["meta"], dict(meta), str(pieces.parent))
+    say_what_differs(saved.meta, dict(meta), str(pieces.parent))
 
 
 def _farewell(pieces: Path, go_on: str) -> str:

@@ -19,9 +19,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-CLEAR_CACHES = (
-    200  # cases, after which compiled programs are forgotten, which would fill the memory
-)
+CLEAR_CACHES = 200  # cases, after which compiled programs are dropped, before they fill the memory
 LONGEST = 120  # seconds after which a case that cannot be stopped ends the process
 
 

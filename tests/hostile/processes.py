@@ -1,7 +1,7 @@
 """Real commands in processes of their own, that start cheaply and can be killed, stopped and starved.
 
-Importing jax and its company costs seconds of CPU time. A server imports them once, starts nothing, and
-forks: each fork runs one command line as its own process would, or stays and runs one after another.
+Importing jax and what goes with it costs seconds of CPU time. A server imports it once, runs no command of
+its own, and forks: each fork runs one command line as its own process would, or one after another.
 """
 
 from __future__ import annotations
@@ -256,7 +256,7 @@ class Server:
 
 
 def serve(descriptor: int) -> None:
-    """Fork for each request until there are no more; returns in nobody but the server."""
+    """Fork for each request until there are no more; only the server itself returns."""
     for name in HEAVY:
         importlib.import_module(name)
     requests = socket.socket(fileno=descriptor)

@@ -47,7 +47,7 @@ PLACES: tuple[tuple[str, str, Any], ...] = (
 
 @contextmanager
 def replaced(*places: tuple[str, str, Any]) -> Iterator[None]:
-    """What stands at some places is something else meanwhile."""
+    """Put something else in some places while the block runs; see ``PLACES``."""
     with ExitStack() as stack:
         for module, name, instead in places:
             importlib.import_module(module)
