@@ -28,7 +28,8 @@ def _leave_quietly() -> None:
     """
     started = Path(sys.argv[0]).name if sys.argv else ""
     as_command = started in ("-m", "mgpo")  # argv[0] is "-m" until ``python -m`` finds the module
-    if as_command and threading.current_thread() is threading.main_thread():
+    ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    if as_command and not ignored and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, lambda number, frame: os._exit(128 + number))
 
 

@@ -20,6 +20,7 @@ from experiments.signals import farewell
 from experiments.store import runs
 from experiments.store.paper import paper_value
 from experiments.store.policies import check_weights
+from experiments.store.provenance import provenance
 from experiments.store.results import load_results
 from experiments.store.seals import write_sealed
 from experiments.store.settings import (
@@ -31,11 +32,10 @@ from experiments.store.settings import (
 from experiments.store.statistics import SeedSpread
 from experiments.store.summary import read_summary
 from experiments.store.tables import number, table
+from experiments.store.work import open_journal
 from experiments.training import train
 from mgpo_jax.claims import claimed
 from mgpo_jax.distributions import HEADS
-from mgpo_jax.files import to_json
-from mgpo_jax.journal import Journal
 from mgpo_jax.methods import UcbHyper
 from mgpo_jax.policy_files import load_policy
 from mgpo_jax.tasks import test_tasks
@@ -92,13 +92,7 @@ def adapted(
     """
     world, env = envs.find(config.env), envs.make(config.env)
     policy = load_policy(world, policy_folder)
-    missing = {folder: hyper for folder, hyper in folders.items() if not folder.exists()}
-    for folder in folders.keys() - missing.keys():
-        check_weights(load_results(folder), policy, f"remove {folder}")
-    if not missing:
-        return
     tasks = test_tasks(world)
-    print(f"adapting with {policy_folder or 'the released policy'}", file=sys.stderr)
     configs = [
         AdaptConfig(
             env=config.env,
@@ -108,15 +102,25 @@ def adapted(
             out=folder,
             hyper=hyper,
         )
-        for folder, hyper in missing.items()
+        for folder, hyper in folders.items()
     ]
-    same = [[deciding(to_json(settings)) for settings in configs], policy.sha256]
-    mark = hashlib.sha256(json.dumps(same).encode()).hexdigest()[:12]
+    for folder in filter(Path.exists, folders):
+        check_weights(load_results(folder, ()), policy, f"remove {folder}")
+    # All of them, whether they are there or not, so that a stop between two of them changes nothing.
+    variants = {"variants": [deciding(settings, policy, tasks) for settings in configs]}
+    mark = hashlib.sha256(json.dumps(variants).encode()).hexdigest()[:12]
     pieces = configs[0].folder.parent / f"{UNFINISHED}{mark}"
+    complete = all(map(Path.exists, folders))
+    if complete and not pieces.exists():
+        return
     with claimed(pieces), farewell(lambda: f"stopped; what is finished is kept, {GO_ON}"):
-        outcomes = adapt_all(world, env, policy, tasks, configs, Journal(pieces))
-        for settings, outcome in zip(configs, outcomes, strict=True):
-            save_outcome(settings.folder, settings, env, policy, tasks, outcome)
+        if not complete:
+            print(f"adapting with {policy_folder or 'the released policy'}", file=sys.stderr)
+            journal, meta = open_journal(pieces, variants, provenance())
+            outcomes = adapt_all(world, env, policy, tasks, configs, journal)
+            for settings, outcome in zip(configs, outcomes, strict=True):
+                if not settings.folder.exists():
+                    save_outcome(settings.folder, settings, env, policy, tasks, outcome, meta)
         shutil.rmtree(pieces)
 
 

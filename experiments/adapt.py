@@ -52,7 +52,7 @@ def main(config: AdaptConfig) -> None:
     policy = load_policy(world, config.policy)
     tasks = chosen_tasks(world, env, config.tasks, config.validation)
     if folder.is_dir():
-        results = finished(folder, config, policy)
+        results = finished(folder, config, policy, tasks)
         print(f"{folder} is finished already", file=sys.stderr)
     else:
         results = adapt_and_save(folder, config, world, env, policy, tasks)

@@ -13,17 +13,20 @@ import numpy as np
 from envs.base import Environment, Task
 from envs.errors import UsageError
 from envs.registry import World
+from experiments.store.layout import META
 from experiments.store.policies import check_weights
 from experiments.store.provenance import provenance
-from experiments.store.results import Results, load_results, results_of, save_results, write_results
+from experiments.store.results import Results, load_results, results_of, write_results
+from experiments.store.runs import changes
 from experiments.store.settings import AdaptConfig
-from experiments.store.summary import summarize
-from experiments.store.work import long_work
+from experiments.store.summary import ADAPT_AGAIN, summarize
+from experiments.store.work import PIECES, long_work
 from mgpo_jax import methods
-from mgpo_jax.files import hash_arrays, remove_leftovers, to_json
+from mgpo_jax.files import hash_arrays, new_folder, remove_leftovers, to_json
 from mgpo_jax.journal import Journal
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.runner import Outcome, sweep
+from mgpo_jax.schema import Json, read_document
 from mgpo_jax.tasks import evaluation_tasks, load_tasks, task_arrays, test_tasks
 
 
@@ -66,27 +69,34 @@ def adapt_all(
     )
 
 
-NO_SETTINGS = ("debug", "figures", "out", "policy", "resume", "tasks")
-"""Settings of the command that do not change its results, or that stand for files whose hash counts."""
+NOT_DECIDING = ("debug", "figures", "out", "policy", "resume", "tasks")
+"""Settings of the command that do not decide about its results, or whose content is hashed instead."""
 
 
-def deciding(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a command that determine its results."""
-    return {name: value for name, value in config.items() if name not in NO_SETTINGS}
+def deciding(config: AdaptConfig, policy: LoadedPolicy, tasks: Task) -> dict[str, Any]:
+    """Everything that decides about the results of an adaptation, as JSON values."""
+    settings = {k: v for k, v in to_json(config).items() if k not in NOT_DECIDING}
+    hashes = {"policy_sha256": policy.sha256, "tasks_sha256": hash_arrays(task_arrays(tasks))}
+    return {**settings, **hashes}
 
 
-def finished(folder: Path, config: AdaptConfig, policy: LoadedPolicy) -> Results:
-    """The results of an adaptation that was finished before it was resumed.
+def finished(folder: Path, config: AdaptConfig, policy: LoadedPolicy, tasks: Task) -> Results:
+    """The results of an adaptation that was finished before ``--resume`` was given.
 
     Raises:
-      UsageError: if they are of other settings.
-      DataError: if they are damaged, or of other weights.
+      UsageError: if they are of other settings or tasks.
+      DataError: if a file is damaged, or they were found with other weights.
     """
-    remove_leftovers(folder)
+    remove_leftovers(folder, PIECES)
     results = load_results(folder)
     check_weights(results, policy, f"remove {folder}, or choose another with --out")
-    if deciding(results.config) != deciding(to_json(config)):
-        raise UsageError(f"{folder} holds results of other settings; choose another with --out")
+    made = read_document(folder / META, dict[str, Json], ADAPT_AGAIN).get("settings")
+    now = deciding(config, policy, tasks)
+    changed = changes(made, now) if isinstance(made, dict) else "made by an older version"
+    if changed:
+        raise UsageError(
+            f"{folder} holds results of other settings: {changed}; choose another with --out"
+        )
     return results
 
 
@@ -101,16 +111,14 @@ def adapt_and_save(
     """Adapt to all tasks as an ``AdaptConfig`` says, and write the results to a new folder.
 
     Raises:
-      UsageError: if there is unfinished work of other settings, or none was asked to be resumed.
+      UsageError: if there is unfinished work that ``--resume`` does not ask for or that has other settings.
       DataError: if the folder exists, another process makes it, or a return is not finite.
     """
-    settings = deciding(to_json(config))
-    settings["policy_sha256"] = policy.sha256
-    settings["tasks_sha256"] = hash_arrays(task_arrays(tasks))
-    with long_work(folder, settings, provenance(), config.resume) as (place, journal):
-        (outcome,) = adapt_all(world, env, policy, tasks, [config], journal)
+    settings = deciding(config, policy, tasks)
+    with long_work(folder, settings, provenance(), config.resume) as work:
+        (outcome,) = adapt_all(world, env, policy, tasks, [config], work.journal)
         results = results_with_summary(config, env, policy, tasks, outcome)
-        write_results(place, results, folder)
+        write_results(work.place, results, folder, work.meta)
     return results
 
 
@@ -121,9 +129,12 @@ def save_outcome(
     policy: LoadedPolicy,
     tasks: Task,
     outcome: Outcome,
+    meta: Mapping[str, Any],
 ) -> None:
-    """Write the results of an adaptation to a new folder."""
-    save_results(folder, results_with_summary(config, env, policy, tasks, outcome))
+    """Write the results of an adaptation to a new folder; ``meta`` says how they were made."""
+    with new_folder(folder) as place:
+        results = results_with_summary(config, env, policy, tasks, outcome)
+        write_results(place, results, folder, meta)
 
 
 def results_with_summary(

@@ -16,6 +16,7 @@ import tyro
 
 import envs
 from experiments.runtime import Common, refuse_existing_file, run, say
+from experiments.signals import farewell
 from experiments.store.settings import DEFAULT_WORLD
 from mgpo_jax.settings import Name, NumTrajectories
 
@@ -53,10 +54,11 @@ def main(config: BenchConfig) -> None:
         find_demonstrator(envs.find(config.env), envs.make(config.env), config.demonstrator)
     rows = []
     num = config.trajectories or (500 if config.quick else 5_000)
-    for row in measurements(config.env, config.demonstrator, num, config.quick):
-        rows.append(row)
-        cells = (row.name, f"{row.value:>10.3f}", row.unit, row.note)
-        say(aligned(cells, COLUMNS))
+    with farewell(lambda: "stopped; the figures so far stand, run it again for the others"):
+        for row in measurements(config.env, config.demonstrator, num, config.quick):
+            rows.append(row)
+            cells = (row.name, f"{row.value:>10.3f}", row.unit, row.note)
+            say(aligned(cells, COLUMNS))
     if config.json:
         write_json(config.json, {"env": config.env, "rows": rows, **provenance()})
         print(f"rows in {config.json}", file=sys.stderr)

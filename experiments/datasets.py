@@ -27,7 +27,7 @@ from envs.registry import World
 from experiments.runtime import refuse_existing
 from experiments.store.provenance import provenance, versions
 from experiments.store.settings import CollectConfig, PretrainConfig, dataset_folder
-from experiments.store.work import long_work
+from experiments.store.work import PIECES, long_work
 from mgpo_jax.claims import check_place
 from mgpo_jax.dataset import STEP_ARRAYS, Dataset, hash_task, load_dataset, write_dataset
 from mgpo_jax.files import ExistsError, remove_leftovers
@@ -266,20 +266,20 @@ def collect_and_save(
     }
     asked = {**made, "trajectories": config.trajectories}
     if config.resume and os.path.isdir(folder):
-        remove_leftovers(folder)
+        remove_leftovers(folder, PIECES)
         load_dataset(folder, env.spec, {**made, "num_trajectories": config.trajectories})
         print(f"{folder} is finished already", file=sys.stderr)
         return
     if not wait:
         refuse_existing(folder, "remove it", "choose another with --out")
     check_place(folder, num_bytes=config.trajectories * SMALLEST_TRAJECTORY)
-    with long_work(folder, asked, provenance(), config.resume, wait, go_on) as (place, journal):
+    with long_work(folder, asked, provenance(), config.resume, wait, go_on) as work:
         cpu = time.process_time()
         dataset, facts = collect(
-            env, demonstrator, config.trajectories, config.seed, world.num_test_tasks, journal
+            env, demonstrator, config.trajectories, config.seed, world.num_test_tasks, work.journal
         )
         cpu = time.process_time() - cpu
-        write_dataset(place, dataset, {**made, "versions": versions(), **facts})
+        write_dataset(work.place, dataset, {**made, "versions": versions(), **facts})
     length, return_ = facts["length"]["mean"], facts["hindsight_return"]["mean"]
     print(
         f"{folder}: {len(dataset)} trajectories, {dataset.lengths.sum()} steps\n"
@@ -310,6 +310,7 @@ def prepare_dataset(
         seed=config.data.data_seed,
     )
     folder = dataset_folder(wanted, name)
+    remove_leftovers(folder, PIECES)
     if not folder.exists():
         text = f"no dataset in {folder} yet: {wanted.trajectories} trajectories are collected first"
         print(text, file=sys.stderr)

@@ -29,7 +29,7 @@ from experiments.figures import (
 )
 from experiments.store.policies import load_policy_of
 from experiments.store.results import Results
-from experiments.store.seals import write_sealed
+from experiments.store.seals import is_foreign, write_sealed
 from experiments.store.settings import file_name
 from experiments.store.statistics import same_tasks
 from mgpo_jax.prompts import prompt_of
@@ -41,14 +41,24 @@ Picture = tuple[str, Save]
 
 
 def draw_run(world: World, results: Results, folder: Path) -> None:
-    """Draw into the folder of one adaptation what needs no policy."""
+    """Draw into the folder of one adaptation what needs no policy.
+
+    A file there that no command wrote as it is stays, and a line on stderr says so.
+    """
     curve = later(learning_curve, {results.method: results}, results.env)
     drawn = [("learning_curve.png", curve)]
     if world.pictures is not None:
         pictures = world.pictures(envs.make(results.env))
         drawn += figures_of_run(pictures, results, results.most_improved())
     for name, save in drawn:
-        write(folder / name, save)
+        if is_foreign(folder / name):
+            print(
+                f"{printable(str(folder / name))} is kept: it was changed, or not written by this command; "
+                "move it away to draw it anew",
+                file=sys.stderr,
+            )
+        else:
+            write(folder / name, save)
 
 
 def pictures_together(

@@ -58,7 +58,9 @@ def main(config: EvaluateConfig) -> None:
     def unfinished() -> str:
         if rows:
             say(table(HEAD, [cells(row) for row in rows]))
-        return f"stopped after {len(rows)} rows; run it again for the others"
+            if config.json:
+                write_json(config.json, {"rows": rows, **provenance()})
+        return f"stopped after {len(rows)} rows; run it again with the runs or noises that are left"
 
     with farewell(unfinished):
         for row in evaluate_cases(cases, config.episodes, config.seed):

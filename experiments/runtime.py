@@ -23,6 +23,7 @@ import threading
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -64,7 +65,7 @@ def configure() -> None:
     # jax reads these when it is imported, which is after a command has found nothing wrong.
     cache = cache_folder()
     try:
-        os.makedirs(cache, exist_ok=True)
+        os.makedirs(cache, mode=0o700, exist_ok=True)  # programs are loaded from there
     except OSError as error:
         print(f"compiled programs are not kept: {cache}: {error.strerror}", file=sys.stderr)
         return
@@ -85,7 +86,7 @@ def cache_folder() -> str:
     try:
         home = Path.home()
     except RuntimeError:  # a user without a home, as in some containers
-        home = Path(tempfile.gettempdir())
+        return os.path.join(tempfile.gettempdir(), f"mgpo_jax-{os.getuid()}")
     return str(home / ".cache" / "mgpo_jax")
 
 
@@ -138,10 +139,31 @@ def _make_sturdy(debug: bool) -> None:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
+    if sys.stderr is None or sys.stderr is sys.__stderr__:
+        sys.stderr = _Tolerant(sys.stderr or open(os.devnull, "w"))  # noqa: SIM115 (for good)
     if not debug and threading.excepthook is threading.__excepthook__:
         threading.excepthook = lambda args: None
     if not debug and sys.unraisablehook is sys.__unraisablehook__:
         sys.unraisablehook = lambda args: None
+
+
+class _Tolerant:
+    """A stream for messages. Where nobody reads them any more, a command goes on without them."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        with suppress(OSError, ValueError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with suppress(OSError, ValueError):
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
 
 
 def say(text: str) -> None:
@@ -172,15 +194,17 @@ def explained(error: BaseException, config: Any = None) -> str:
             again = "--resume" if hasattr(config, "resume") else "the same command"
             return f"there is no room left on the disk{where}; make room and go on with {again}"
         if isinstance(cause, OSError) and cause.errno in (errno.EACCES, errno.EROFS, errno.EPERM):
-            return f"{cause.filename} cannot be written or read ({cause.strerror})"
+            what = cause.filename or "a file"
+            return f"{what} cannot be read or written ({cause.strerror}); change its rights"
         if isinstance(cause, OSError) and cause.errno == errno.ENAMETOOLONG:
             return f"the name {shown(cause.filename)} is too long; choose a shorter one"
-        if isinstance(cause, MemoryError):
-            return "there is not enough memory; ask for less at once, such as fewer --seeds"
-    text = str(error).splitlines()[0] if str(error) else type(error).__name__
-    if "backend" in text and (platforms := os.environ.get("JAX_PLATFORMS")):
+        if isinstance(cause, MemoryError) or "RESOURCE_EXHAUSTED" in str(cause):
+            return "there is not enough memory; ask for less at once"
+    text = str(error).splitlines()[0] if str(error) else "no reason is known"
+    platforms = os.environ.get("JAX_PLATFORMS")
+    if platforms and "nable to initialize backend" in text:
         return f"JAX_PLATFORMS={platforms} names no device of this machine; unset it, or use cpu"
-    return f"{type(error).__name__}: {text} (run with --debug for the traceback)"
+    return f"something went wrong that was not foreseen: {text}; run with --debug to see where"
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:

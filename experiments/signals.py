@@ -13,7 +13,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 
 SIGNALS = tuple(
@@ -40,31 +40,37 @@ class _Watch:
         self.asked: list[int] = []
         self.farewell: Callable[[], str] = lambda: ""
         self.patient = False
+        self.leaving = False
 
     def receive(self, number: int) -> None:
+        """React to a signal; returns at once, so that the next one can be received."""
         self.asked.append(number)
-        if len(self.asked) == 1 and self.patient:
+        if self.leaving:
+            os._exit(128 + number)
+        elif self.patient and len(self.asked) == 1:
             _say("stopping soon; a second request ends it at once")
-            return
-        if len(self.asked) == 1 and (text := self.farewell()):
-            _say(text)
-        leave(number)
+        else:
+            self.leaving = True
+            threading.Thread(target=self._leave, args=(number,), daemon=True).start()
+
+    def _leave(self, number: int) -> None:
+        """Say how to go on, clean up, and end the process, whatever it is doing."""
+        from mgpo_jax.claims import clean_up
+
+        try:
+            if not self.patient and (text := self.farewell()):
+                _say(text)
+            clean_up()
+        finally:
+            os._exit(128 + number)
 
 
 _watch = _Watch()
 
 
 def _say(text: str) -> None:
-    if sys.stderr is not None:
+    with suppress(OSError, ValueError):  # nobody may be reading any more
         print(f"\n{text}" if sys.stderr.isatty() else text, file=sys.stderr, flush=True)
-
-
-def leave(number: int) -> None:
-    """Clean up and end the process, whatever it is doing, with 128 plus the signal's number."""
-    from mgpo_jax.claims import clean_up
-
-    clean_up()
-    os._exit(128 + number)
 
 
 @contextmanager
@@ -76,7 +82,9 @@ def watched() -> Iterator[None]:
     _watch.forget()
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
-    before = {number: signal.signal(number, _nothing) for number in SIGNALS}
+    # What the parent has told us to ignore, as a script does for its background jobs, stays ignored.
+    heard = [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, _nothing) for number in heard}
     pipe_before = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
     listener = threading.Thread(target=_listen, args=(reading,), daemon=True)
     listener.start()

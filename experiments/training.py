@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -22,7 +21,7 @@ from experiments.datasets import find_demonstrator, prepare_dataset
 from experiments.figures import training_curve
 from experiments.signals import Stopped, asked_to_stop, farewell
 from experiments.store import runs
-from experiments.store.metrics import Metrics, check_loggers
+from experiments.store.metrics import METRICS, Metrics, check_loggers, salvaged_rows
 from experiments.store.provenance import provenance
 from experiments.store.settings import PretrainConfig
 from mgpo_jax.checkpoint import Snapshot, checkpoints, restore_state, save_state
@@ -192,22 +191,29 @@ def train(config: PretrainConfig, go_on: str = "continue with --resume") -> None
     folder = config.folder
     with claimed(folder), farewell(lambda: f"stopped; {go_on}" if runs.has_begun(folder) else ""):
         remove_unfinished(folder)
+        if runs.has_begun(folder):
+            runs.check_start(config)
+            if runs.is_finished(folder):
+                print(f"{folder} is finished already", file=sys.stderr)
+                return
         run = Run(config, go_on)
         with checkpoints(run.folder / runs.CHECKPOINTS) as manager:
             blank = run.trainer.init()
             before = restore_state(manager, blank, run.identity) if config.resume else None
             before = before or Snapshot(blank, [], [])
+            rows = before.measured
+            if rows is None:  # a checkpoint of an older version
+                rows = salvaged_rows(folder / METRICS, before.state.step)
             if config.resume:
                 step = before.state.step
                 print(f"resuming {run.folder} at step {step}", file=sys.stderr)
-            metrics = Metrics(run.folder, config, before.measured)
+            metrics = Metrics(run.folder, config, rows)
             with asked_to_stop() as stopping:
                 state = _take_steps(run, before, metrics, manager, stopping, go_on)
         made = {"env": config.env, "config": to_json(config), "steps": state.step}
         policy = run.folder / runs.POLICY
-        shutil.rmtree(policy, ignore_errors=True)  # of a finished run that is resumed
         save_policy(policy, run.network, state.params, made)
-        with written(run.folder / "training.png") as picture:
+        with written(run.folder / runs.PICTURE) as picture:
             training_curve(metrics.rows).savefig(picture)
     print(f"policy written to {policy}", file=sys.stderr)
 

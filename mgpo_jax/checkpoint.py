@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import json
 import logging
-import shutil
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import chain, count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,8 +33,8 @@ class Snapshot(NamedTuple):
     """What a checkpoint holds."""
 
     state: TrainState
-    measured: list[dict[str, float]]
-    """The rows of metrics up to here."""
+    measured: list[dict[str, float]] | None
+    """The rows of metrics up to here; None if an older version saved it, which did not keep them."""
     pending: list[dict[str, float]]
     """The metrics of the steps since the last row."""
 
@@ -113,7 +113,9 @@ def restore_state(
         try:
             found = {k: np.asarray(v) for k, v in _read(manager, step).items()}
             _check_hash(found)
-        except Exception:  # Orbax raises many kinds for a damaged file
+        except Exception as error:  # Orbax raises many kinds for a damaged file
+            if isinstance(error, MemoryError) or _is_of_the_machine(error):
+                raise  # the file may be sound
             _set_aside(where, root.with_name(root.name + DAMAGED))
             manager.reload()  # else it refuses to save steps up to the one that is gone
             continue
@@ -137,17 +139,22 @@ def _check_hash(found: dict[str, np.ndarray]) -> None:
         raise ValueError("hash")
 
 
+def _is_of_the_machine(error: Exception) -> bool:
+    """Whether reading failed for another reason than what is, or is not, in the files."""
+    return isinstance(error, OSError) and not isinstance(error, FileNotFoundError | EOFError)
+
+
 def _set_aside(checkpoint: Path, damaged: Path) -> None:
     damaged.mkdir(exist_ok=True)
-    place = damaged / checkpoint.name
-    shutil.rmtree(place, ignore_errors=True)
+    names = chain([checkpoint.name], (f"{checkpoint.name}-{number}" for number in count(2)))
+    place = next(damaged / name for name in names if not (damaged / name).exists())
     checkpoint.rename(place)
     print(f"checkpoint {checkpoint} is damaged; it was moved to {place}", file=sys.stderr)
 
 
 def _snapshot(found: dict[str, np.ndarray], blank: TrainState, step: int, where: Path) -> Snapshot:
     """A checkpoint's arrays as the records that they were made of."""
-    rows: dict[str, Any] = {"measured": [], "pending": []}
+    rows: dict[str, Any] = {"measured": None, "pending": []}
     if _ROWS in found:
         rows = json.loads(found.pop(_ROWS).tobytes())
     found.pop(_IDENTITY, None)

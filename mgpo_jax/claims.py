@@ -12,6 +12,7 @@ import os
 import shutil
 import socket
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -19,6 +20,7 @@ from pathlib import Path
 from envs.errors import DataError, UsageError, printable
 
 LOCK = ".lock"
+ATTEMPTS = 1000  # at holding a folder that others make and remove
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)  # of a disk that is full
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # of some network file systems
 _ON_EXIT: list[Callable[[], None]] = []
@@ -68,8 +70,13 @@ def claimed(folder: Path, wait: bool = False) -> Iterator[None]:
         check_place(folder, num_bytes=0)
     made = [above for above in folder.absolute().parents if not above.exists()]
     descriptor = None
-    while descriptor is None:
+    for _ in range(ATTEMPTS):
         descriptor = _try_to_hold(folder, wait)
+        if descriptor is not None:
+            break
+        time.sleep(0.001)
+    else:
+        raise cannot_write(folder, "it is made and removed all the time")
     claim = Claim(folder, descriptor, made)
     try:
         with cleaned_on_exit(claim.leave):
@@ -79,14 +86,14 @@ def claimed(folder: Path, wait: bool = False) -> Iterator[None]:
 
 
 def _try_to_hold(folder: Path, wait: bool) -> int | None:
-    """The descriptor of a lock that is held; None if the folder vanished meanwhile."""
+    """The descriptor of a lock that is held; None if another process removed the folder meanwhile."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    except FileNotFoundError:
-        if folder.parent.is_dir() and not os.path.lexists(folder):
-            return None  # removed between the two calls by the process that held it
-        raise cannot_write(folder, "no such place") from None
+    except (FileNotFoundError, FileExistsError) as error:
+        if os.path.lexists(folder) and not folder.is_dir():
+            raise cannot_write(folder, error.strerror) from None
+        return None
     except OSError as error:
         if error.errno in NO_ROOM:
             raise  # that is no fault of the request

@@ -21,9 +21,10 @@ from typing import Any
 
 import numpy as np
 
-from envs.errors import DataError
+from envs.errors import DataError, UsageError
 from mgpo_jax.claims import LOCK, InUseError, claimed, cleaned_on_exit
 
+PLACE = "result"  # what is being written, in an unfinished folder
 TEMPORARY = ".writing-"  # how the names of files begin that are being written
 
 
@@ -125,9 +126,10 @@ def new_folder(folder: Path, keep: str = "", wait: bool = False) -> Iterator[Pat
     with claimed(partial, wait=wait):
         if os.path.lexists(folder):  # another process has finished it meanwhile
             raise exists_already(folder)
+        _check_own(partial, keep)
         clear = functools.partial(_clear, partial, keep)
         clear()
-        place = partial / "result"
+        place = partial / PLACE
         place.mkdir()
         try:
             with cleaned_on_exit(clear):
@@ -138,14 +140,21 @@ def new_folder(folder: Path, keep: str = "", wait: bool = False) -> Iterator[Pat
             raise
         flush_folder(folder.parent)
         _clear(partial)
+        if keep:
+            shutil.rmtree(partial / keep, ignore_errors=True)
 
 
-def remove_leftovers(folder: Path) -> None:
-    """Remove what a process left beside a finished folder, if it was killed right after making it."""
+def remove_leftovers(folder: Path, keep: str = "") -> None:
+    """Remove what a process left beside a finished folder, if it was killed right after making it.
+
+    ``keep`` is that of ``new_folder``.
+    """
     partial = partial_name(folder)
     if os.path.isdir(folder) and os.path.isdir(partial):
         with suppress(InUseError), claimed(partial):
             _clear(partial)
+            if keep:
+                shutil.rmtree(partial / keep, ignore_errors=True)
 
 
 class ExistsError(DataError):
@@ -163,15 +172,20 @@ def partial_name(folder: Path) -> Path:
 
 
 def _clear(partial: Path, keep: str = "") -> None:
-    """Remove what is in an unfinished folder, but for the claim on it and finished work in ``keep``."""
-    kept = {LOCK, keep if keep and has_work(partial / keep) else LOCK}
-    for path in partial.iterdir() if partial.is_dir() else ():
-        if path.name in kept:
-            continue
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)
+    """Remove what ``new_folder`` writes in an unfinished folder, but for finished work in ``keep``."""
+    shutil.rmtree(partial / PLACE, ignore_errors=True)
+    if keep and not has_work(partial / keep):
+        shutil.rmtree(partial / keep, ignore_errors=True)
+
+
+def _check_own(partial: Path, keep: str) -> None:
+    """Raise ``UsageError`` if an unfinished folder holds what ``new_folder`` did not write."""
+    foreign = [path for path in partial.iterdir() if path.name not in (LOCK, PLACE, keep)]
+    if foreign:
+        raise UsageError(
+            f"{foreign[0]} is in the way, which is no work of a command; move it, or choose another place "
+            "with --out"
+        )
 
 
 def has_work(folder: Path) -> bool:

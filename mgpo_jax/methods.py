@@ -202,7 +202,7 @@ class BbtHyper(PromptHyper):
     """Population of CMA-ES [10]."""
     latent_dim: Annotated[int, Ge(1), Le(4_096)] = static(5)
     """Size of z."""
-    std_init: Positive = 0.5
+    std_init: Annotated[float, Gt(0), Le(1_000)] = 0.5
     """Initial step size, in units of goals."""
 
 

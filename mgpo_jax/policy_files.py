@@ -7,7 +7,10 @@ the weights, how they were made) and, beside them, whatever the release adds.
 from __future__ import annotations
 
 import dataclasses
+import functools
+import os
 import re
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,9 +24,19 @@ from pydantic import BaseModel
 from envs.base import ArraySpec, EnvSpec
 from envs.errors import DataError, UsageError, shown
 from envs.registry import World, find
+from mgpo_jax.claims import claimed, cleaned_on_exit
 from mgpo_jax.distributions import HEADS
 from mgpo_jax.encoders import ENCODERS
-from mgpo_jax.files import hash_file, new_folder, write_arrays, write_json
+from mgpo_jax.files import (
+    PLACE,
+    TEMPORARY,
+    flush_folder,
+    hash_file,
+    new_folder,
+    partial_name,
+    write_arrays,
+    write_json,
+)
 from mgpo_jax.policy import LoadedPolicy, check_fits
 from mgpo_jax.prompts import single_goal
 from mgpo_jax.released import released_folder
@@ -44,6 +57,7 @@ from mgpo_jax.transformer import GoalTransformer, TransformerConfig
 FORMAT = 2  # 1 had flat observations of size obs_dim
 WEIGHTS = "weights.npz"
 CONFIG = "config.json"
+BEFORE = "before"  # the folder of the old policy for the moment in which the new one takes its name
 MEND = "give the folder of another policy, or train it again"
 DTYPES = (
     "bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64",
@@ -53,9 +67,9 @@ DTYPES = (
 
 
 def save_policy(folder: Path, config: TransformerConfig, params: Any, made: dict[str, Any]) -> None:
-    """Write a policy, which replaces one that is there.
+    """Write a policy, which replaces one that is there; other files beside that one stay.
 
-    A folder holds a whole policy or none, whenever the process is killed.
+    However the process ends, the folder holds the old policy or the new one, whole.
 
     Args:
       folder: where to.
@@ -72,12 +86,50 @@ def save_policy(folder: Path, config: TransformerConfig, params: Any, made: dict
         if not np.isfinite(array).all():
             raise DataError(f"{folder} is not written: weight {name} holds NaN or infinity")
     document = {"format": FORMAT, "network": dataclasses.asdict(config), "made": made}
-    if not folder.exists():
-        with new_folder(folder) as partial:
-            _write_policy(partial, arrays, document)
-        return
-    (folder / CONFIG).unlink(missing_ok=True)  # without it, a folder holds no policy
-    _write_policy(folder, arrays, document)
+    _finish_exchange(folder)
+    if folder.is_dir():
+        _exchange(folder.resolve(), arrays, document)
+    else:
+        with new_folder(folder) as place:
+            _write_policy(place, arrays, document)
+
+
+def _exchange(folder: Path, arrays: Mapping[str, np.ndarray], document: Mapping[str, Any]) -> None:
+    """Write a policy beside the folder of another one, with what else lies there, and exchange the two."""
+    partial = partial_name(folder)
+    with claimed(partial):
+        place, before = partial / PLACE, partial / BEFORE
+        clear = functools.partial(shutil.rmtree, place, ignore_errors=True)
+        clear()
+        try:
+            with cleaned_on_exit(clear):
+                other_files = shutil.ignore_patterns(WEIGHTS, CONFIG, f"{TEMPORARY}*")
+                shutil.copytree(folder, place, symlinks=True, ignore=other_files)
+                _write_policy(place, arrays, document)
+            os.rename(folder, before)
+            os.rename(place, folder)
+        except BaseException:
+            _put_back(before, folder)
+            clear()
+            raise
+        flush_folder(folder.parent)
+        shutil.rmtree(before)
+
+
+def _finish_exchange(folder: Path) -> None:
+    """Put the old policy back, or remove it, where a process was killed while it exchanged two."""
+    folder = folder.resolve()
+    before = partial_name(folder) / BEFORE
+    if before.is_dir():
+        with claimed(partial_name(folder)):
+            _put_back(before, folder)
+            shutil.rmtree(before, ignore_errors=True)
+
+
+def _put_back(before: Path, folder: Path) -> None:
+    """Give a folder that was moved away its name back, unless another one has it."""
+    if before.is_dir() and not os.path.lexists(folder):
+        os.rename(before, folder)
 
 
 def _write_policy(

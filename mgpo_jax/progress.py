@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from types import TracebackType
 from typing import Any
@@ -25,16 +26,20 @@ class Progress:
         self._bar = tqdm(total=total, initial=initial, unit=unit, disable=None)
         self._total, self._unit, self._initial = total, unit, initial
         self._done, self._figures = initial, ""
-        self._start = self._last = time.monotonic()
+        self._start = time.monotonic()
+        self._closed = threading.Event()
+        if self._bar.disable:
+            threading.Thread(target=self._report, daemon=True).start()
+
+    def _report(self) -> None:
+        """Print lines until the work is done."""
+        while not self._closed.wait(EVERY):
+            print(self._line(time.monotonic()), file=sys.stderr, flush=True)
 
     def update(self, num: int = 1) -> None:
         """Count ``num`` more."""
         self._bar.update(num)
         self._done += num
-        now = time.monotonic()
-        if self._bar.disable and now - self._last >= EVERY:
-            self._last = now
-            print(self._line(now), file=sys.stderr, flush=True)
 
     def show(self, figures: dict[str, str]) -> None:
         """Figures to stand beside the count from now on."""
@@ -42,13 +47,13 @@ class Progress:
         self._figures = "".join(f", {name} {value}" for name, value in figures.items())
 
     def _line(self, now: float) -> str:
-        per_unit = (now - self._start) / max(self._done - self._initial, 1)
-        left = per_unit * (self._total - self._done)
         share = 100 * self._done / max(self._total, 1)
-        return (
-            f"{self._unit} {self._done:,} of {self._total:,} ({share:.0f} %){self._figures}, "
-            f"{_duration(left)} left"
-        )
+        text = f"{self._unit} {self._done:,} of {self._total:,} ({share:.0f} %){self._figures}"
+        num_new = self._done - self._initial
+        if not num_new:
+            return text
+        left = (now - self._start) / num_new * (self._total - self._done)
+        return f"{text}, {_duration(left)} left"
 
     def __enter__(self) -> Progress:
         return self
@@ -64,6 +69,7 @@ class Progress:
 
     def close(self) -> None:
         """End the bar, which leaves its last state on the terminal."""
+        self._closed.set()
         self._bar.close()
 
 

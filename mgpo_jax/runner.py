@@ -466,8 +466,10 @@ def _run(
     state = programs.start.compile(lanes, params)(lanes, params)
     shared = (params, jnp.int32(0), jnp.int32(0))
     advance = programs.advance.compile((state, lanes), shared)
-    shapes = jax.eval_shape(programs.advance.jitted, (state, lanes), shared)
-    done, state = _resumed(journal, grid, layout, state, shapes[1:])
+    done: list[Segment] = []
+    if (saved := journal.read("state")) is not None:
+        shapes = jax.eval_shape(programs.advance.jitted, (state, lanes), shared)
+        done, state = _resumed(journal, saved, grid, layout, state, shapes[1:])
     rounds = [0, *segments]
     before = sum(rounds[: len(done)])
     with Progress(sum(rounds) * per_round, "episode", before * per_round) as progress:
@@ -482,8 +484,9 @@ def _run(
             judged = jax.tree.map(lambda rows: rows[: grid.size], judged)
             _check_finite(log, judged, grid, before)
             done.append(Segment(log, judged, cpu))
-            _keep(journal, number, done[-1], fetch(state), grid)
+            _keep(journal, number, done[-1], state, grid)
             progress.update(num * per_round)
+            progress.show({"return": f"{judged.return_.mean():.3f}"})
             before += num
     logs = [segment.log for segment in done[1:]]
     goals = [log.played.goals for log in logs]
@@ -515,20 +518,22 @@ def _keep(journal: Journal, number: int, segment: Segment, state: Any, grid: Gri
     if journal.folder is None:
         return
     journal.write(f"segment{number:04}", numbered_leaves(segment))
-    own = jax.tree.map(lambda rows: rows[: grid.size], state)
+    own = jax.tree.map(lambda rows: rows[: grid.size], fetch(state))
     journal.write("state", {**numbered_leaves(own), "segments": np.array(number + 1)})
 
 
 def _resumed(
-    journal: Journal, grid: Grid, layout: Layout, state: Any, shapes: tuple[Any, Any]
+    journal: Journal,
+    saved: dict[str, np.ndarray],
+    grid: Grid,
+    layout: Layout,
+    state: Any,
+    shapes: tuple[Any, Any],
 ) -> tuple[list[Segment], Any]:
     """The finished segments in a journal and the state after them.
 
     If any of them is missing, there are none, and the state is the first one.
     """
-    saved = journal.read("state")
-    if saved is None:
-        return [], state
     records = [journal.read(f"segment{i:04}") for i in range(int(saved.pop("segments")))]
     like = Segment(*jax.tree.map(lambda leaf: 0, shapes), cpu_seconds=0.0)
     done = [with_leaves(like, record) for record in records if record is not None]
@@ -594,8 +599,12 @@ def evaluate(
     run = _measurement(env, policy.config, layout, episodes)
     found = fetch(run(split(layout.mesh, own), replicate(layout.mesh, policy.params)))
     found = jax.tree.map(lambda rows: grid.shape(rows)[0], found)
-    if not np.isfinite(found.return_).all():
-        raise DataError("a return is not finite; the world or the policy is broken")
+    if not (finite := np.isfinite(found.return_)).all():
+        which, task = np.argwhere(~finite)[0]
+        raise DataError(
+            f"a return on task {task} with seed number {which} is {found.return_[which, task]}; the world "
+            "or the policy is broken"
+        )
     return found.return_, int(found.num_failed.sum())
 
 

@@ -43,6 +43,8 @@ from envs.errors import DataError, printable, shown
 MAX_DOCUMENT = 16 << 20  # bytes of a JSON file; ours have some kB
 STRICT = ConfigDict(strict=True, allow_inf_nan=False, extra="forbid")
 
+SHA256 = r"^[0-9a-f]{64}$"
+
 LIMITS: Mapping[str, str] = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
 """The limits of a range in words."""
 
@@ -60,7 +62,7 @@ _WORDS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
     "string_type": lambda limits: "must be text",
     "is_instance_of": lambda limits: f"must be a {limits['class']}",
     "none_required": lambda limits: "must be null",
-    "string_pattern_mismatch": lambda limits: "is not a name that is allowed here",
+    "string_pattern_mismatch": lambda limits: _pattern(limits["pattern"]),
     "string_too_long": lambda limits: f"must have at most {limits['max_length']} characters",
     "too_long": lambda limits: f"must have at most {limits['max_length']} entries",
     "too_short": lambda limits: f"must have at least {limits['min_length']} entries",
@@ -76,6 +78,12 @@ def _limit(name: str, limits: Mapping[str, Any]) -> str:
     return f"must be {LIMITS[name]} {limits[name]:.12g}"
 
 
+def _pattern(pattern: str) -> str:
+    if pattern == SHA256:
+        return "must be a SHA-256, 64 hexadecimal digits"
+    return "is not a name that is allowed here"
+
+
 def _all_finite(value: Any) -> Any:
     """The JSON value, if it holds neither NaN nor infinity, which the parser lets pass."""
     rest = [value]
@@ -89,7 +97,7 @@ def _all_finite(value: Any) -> Any:
 
 Json = Annotated[JsonValue, AfterValidator(_all_finite)]
 """Anything that JSON can hold."""
-Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
+Sha256 = Annotated[str, StringConstraints(pattern=SHA256)]
 """The hash of a file."""
 Name = Annotated[str, StringConstraints(pattern=r"^\w[\w.-]{0,99}(:\w[\w.]{0,99})?$")]
 """The name of a world or a method, or its place as ``module:attribute``; it can stand in a path."""
@@ -111,6 +119,8 @@ def fault(type_: Any, value: Any) -> str | None:
     >>> fault(Annotated[float, Gt(0)], -1.0)
     'must be above 0, found -1.0'
     """
+    if isinstance(value, np.generic):  # a number of numpy is as good as one of Python
+        value = value.item()
     try:
         _adapter(type_).validate_python(value)
     except ValidationError as error:
@@ -212,7 +222,8 @@ def _document_fault(error: ValidationError, entry: str = "") -> str:
 MAX_MEMBERS = 10_000
 MAX_HEADER = 4096  # bytes; numpy writes 118
 FREE, MAX_RATIO = 512 << 20, 100
-"""Arrays of more bytes than ``FREE`` may have at most ``MAX_RATIO`` times as many as their file."""
+"""Arrays whose sizes are not known beforehand may have ``FREE`` bytes together, or ``MAX_RATIO`` times
+those of their file."""
 DEFLATE = 1032  # bytes that one deflated byte can stand for
 CHUNK = 1 << 20  # bytes that are read, checked and converted at a time
 LARGEST = 1e18  # of a number, unless its field says otherwise
@@ -242,6 +253,7 @@ class ArrayField:
       required: whether it has to be there.
       low: its smallest value (default: the smallest of the dtype, -1e18 for floats).
       high: its largest value, likewise.
+      any_value: whether it may hold anything, NaN and infinity included.
     """
 
     shape: tuple[int | str | EllipsisType, ...]
@@ -249,6 +261,7 @@ class ArrayField:
     required: bool = True
     low: int | float | None = None
     high: int | float | None = None
+    any_value: bool = False
 
     @property
     def kinds(self) -> str:
@@ -336,8 +349,9 @@ def read_arrays(
             name: _header(archive, name, members[name]) for name in fields if name in members
         }
         _check_kinds(headers, fields)
-        _check_claims(headers, fields, members, path.stat().st_size)
+        _check_claims(headers, members)
         _check_shapes(headers, fields, sizes or {})
+        _check_unpacked_size(headers, fields, sizes or {}, path.stat().st_size)
         return {
             name: _read_member(archive, members[name], name, header, fields[name])
             for name, header in headers.items()
@@ -500,10 +514,7 @@ def _described(axis: int | str | EllipsisType, known: Mapping[str, range]) -> st
 
 
 def _check_claims(
-    headers: Mapping[str, ArrayHeader],
-    fields: Mapping[str, ArrayField],
-    members: Mapping[str, zipfile.ZipInfo],
-    file_size: int,
+    headers: Mapping[str, ArrayHeader], members: Mapping[str, zipfile.ZipInfo]
 ) -> None:
     """Raise if an array cannot have the size that its header claims, before memory is taken for it."""
     for name, header in headers.items():
@@ -516,13 +527,29 @@ def _check_claims(
                 f": {name} claims shape {list(header.shape)} of {header.dtype}, the file has "
                 f"{min(held, most)} bytes of it"
             )
+
+
+def _check_unpacked_size(
+    headers: Mapping[str, ArrayHeader],
+    fields: Mapping[str, ArrayField],
+    sizes: Sizes,
+    file_size: int,
+) -> None:
+    """Raise if a small file would fill the memory with arrays that nobody expects to be so large."""
     total = sum(
-        header.size * fields[name].target(header.dtype).itemsize for name, header in headers.items()
+        header.size * fields[name].target(header.dtype).itemsize
+        for name, header in headers.items()
+        if not _is_expected(fields[name], sizes)
     )
     if total > max(FREE, MAX_RATIO * file_size):
         raise _FaultError(
             f" claims {total >> 20} MB of arrays in a file of {file_size >> 20} MB, which cannot be sound"
         )
+
+
+def _is_expected(field: ArrayField, sizes: Sizes) -> bool:
+    """Whether the sizes of all axes of an array are known before its file is opened."""
+    return all(isinstance(axis, int) or isinstance(sizes.get(axis), int) for axis in field.shape)
 
 
 def _read_member(
@@ -551,7 +578,8 @@ def _read_member(
                     else np.frombuffer(raw, header.dtype)
                 )
                 _check_values(values, name, header, field, first)
-                flat[first : first + len(values)] = values
+                with np.errstate(all="ignore"):  # where any value is allowed, it may be too large
+                    flat[first : first + len(values)] = values
                 first += len(values)
             file.read(1)  # compares the checksum of the member
     except _UNREADABLE:
@@ -563,7 +591,7 @@ def _check_values(
     values: np.ndarray, name: str, header: ArrayHeader, field: ArrayField, first: int = 0
 ) -> None:
     """Raise for the first of some numbers, counted from ``first``, that its field does not allow."""
-    if values.dtype.kind == "b" or not len(values):
+    if field.any_value or values.dtype.kind == "b" or not len(values):
         return
     low, high = field.limits(field.target(header.dtype))
     with np.errstate(all="ignore"):

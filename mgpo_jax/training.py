@@ -356,8 +356,8 @@ def finite_metrics(step: int, metrics: Mapping[str, Any]) -> dict[str, Any]:
 def diverged(step: int, metric: str, value: Any) -> DataError:
     """The error for a training in which a metric is not finite after a step."""
     return DataError(
-        f"training stopped at step {step}: {metric} became {value}; use a lower --learning-rate or "
-        "a lower --clip-norm"
+        f"training stopped at step {step}: {metric} became {value}; start a new run with a lower learning "
+        "rate or a lower clip norm"
     )
 
 

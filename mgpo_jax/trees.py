@@ -36,7 +36,7 @@ def named_leaves(tree: Any, lone: str) -> dict[str, Any]:
 
 def numbered_leaves(tree: Any) -> dict[str, np.ndarray]:
     """The leaves of a pytree by their place in it, to be written to a file."""
-    return {f"leaf{i:03}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(tree))}
+    return {f"leaf{i:05}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(tree))}
 
 
 def with_leaves(like: Any, leaves: Mapping[str, np.ndarray]) -> Any:

@@ -18,6 +18,7 @@ from jax.flatten_util import ravel_pytree
 
 import envs
 from envs.errors import DataError
+from mgpo_jax import checkpoint
 from mgpo_jax.checkpoint import (
     Snapshot,
     _named_leaves,
@@ -89,7 +90,7 @@ def test_a_checkpoint_without_hash_is_read(tmp_path: Path, params: dict) -> None
         manager.save(5, args=ocp.args.StandardSave(_named_leaves(train_state(params, 5))))
         found = restore_state(manager, train_state(params, 0), "aa" * 32)
     assert found is not None
-    assert (found.state.step, found.measured, found.pending) == (5, [], [])
+    assert (found.state.step, found.measured, found.pending) == (5, None, [])
 
 
 def damage(checkpoint: Path, how: str) -> None:
@@ -126,6 +127,35 @@ def test_a_damaged_checkpoint_is_set_aside(
         again = restore_state(manager, blank)
     assert again is not None
     assert again.state.step == 7
+
+
+@pytest.mark.parametrize("error", [PermissionError(13, "denied"), MemoryError()])
+def test_a_fault_of_the_machine_sets_nothing_aside(
+    tmp_path: Path, params: dict, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    folder = tmp_path / "checkpoints"
+
+    def fail(*args: object) -> None:
+        raise error
+
+    with checkpoints(folder) as manager:
+        save_state(manager, snapshot(params, 3))
+        monkeypatch.setattr(checkpoint, "_read", fail)
+        with pytest.raises(type(error)):
+            restore_state(manager, train_state(params, 0))
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoints"]
+
+
+def test_what_was_set_aside_stays(tmp_path: Path, params: dict) -> None:
+    folder = tmp_path / "checkpoints"
+    for _ in range(2):
+        with checkpoints(folder) as manager:
+            save_state(manager, snapshot(params, 3))
+        damage(folder / "3", "cut")
+        with checkpoints(folder) as manager:
+            assert restore_state(manager, train_state(params, 0)) is None
+    names = sorted(path.name for path in (tmp_path / "checkpoints-damaged").iterdir())
+    assert names == ["3", "3-2"]
 
 
 def test_no_sound_checkpoint_is_left(tmp_path: Path, params: dict) -> None:

@@ -334,7 +334,6 @@ def test_resumed_run_equals_an_uninterrupted_one(
         assert row.pop("cpu_seconds_per_step") > 0
     assert rows[0] == rows[1]
     assert [row["step"] for row in rows[0]] == [3, 6]
-    assert command(f"{line} --resume")[0] == 0  # a finished run has nothing left to do
 
 
 def test_a_moved_run_goes_on(command: Run, workspace: Path) -> None:
@@ -350,6 +349,7 @@ def test_a_moved_run_goes_on(command: Run, workspace: Path) -> None:
 def test_training_on_another_dataset_is_refused(command: Run, workspace: Path) -> None:
     data = workspace / "data/maze15/astar4-40-seed0"
     shutil.rmtree(data)
+    (workspace / RUN / "training.png").unlink()  # the run is not quite finished
     assert command("collect --episodes 40 --seed 5")[0] == 0
     shutil.move(workspace / "data/maze15/astar4-40-seed5", data)
     manifest = json.loads((data / "manifest.json").read_text())
@@ -384,6 +384,7 @@ def test_a_folder_with_other_files_is_left_alone(command: Run, workspace: Path) 
 
 def test_a_run_without_meta_goes_on(command: Run, workspace: Path) -> None:
     (workspace / RUN / "meta.json").unlink()
+    (workspace / RUN / "training.png").unlink()  # the last thing that a run writes
     assert command(f"{TINY} --resume")[0] == 0
     assert "dataset_sha256" in json.loads((workspace / RUN / "meta.json").read_text())
 
@@ -393,8 +394,42 @@ def test_a_torn_row_of_metrics_is_made_good(command: Run, workspace: Path) -> No
     path = workspace / RUN / "metrics.jsonl"
     whole = path.read_text()
     path.write_text(whole[:-40] + "\0\0")
+    (workspace / RUN / "training.png").unlink()  # the last thing that a run writes
     assert command(f"{TINY} --resume")[0] == 0
     assert path.read_text() == whole
+
+
+def test_a_checkpoint_of_an_older_version_keeps_the_rows_of_the_file(
+    command: Run, workspace: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It does not hold them; the file is all that there is."""
+    path = workspace / RUN / "metrics.jsonl"
+    whole = path.read_text()
+    path.write_text(whole + "{torn")
+    (workspace / RUN / "training.png").unlink()
+    restore = training.restore_state
+
+    def without_rows(*args: Any) -> Any:
+        return restore(*args)._replace(measured=None)
+
+    monkeypatch.setattr(training, "restore_state", without_rows)
+    code, text = command(f"{TINY} --resume")
+    assert code == 0
+    assert "1 rows are damaged and left out" in text
+    assert path.read_text() == whole
+
+
+def test_a_finished_run_has_nothing_left_to_do(command: Run, workspace: Path) -> None:
+    """Neither its dataset nor its policy is touched."""
+    shutil.rmtree("data")
+    before = {path: path.read_bytes() for path in RUN.rglob("*") if path.is_file()}
+    code, text = command(f"{TINY} --resume")
+    assert (code, text) == (0, f"{RUN} is finished already\n")
+    assert before == {path: path.read_bytes() for path in RUN.rglob("*") if path.is_file()}
+    assert not Path("data").exists()
+    code, text = command(f"{TINY} --resume --data-seed 7")
+    assert (code, "data_seed 0 -> 7" in text) == (2, True)
+    assert not Path("data").exists()
 
 
 def test_a_loss_that_is_not_finite_stops_the_training(
@@ -466,6 +501,13 @@ def test_adapt_writes_what_it_prints(
     np.testing.assert_allclose(
         np.maximum.accumulate(greedy, axis=-1)[:, :, [0, 1, 3, 4]], raw["eval_returns"], atol=1e-5
     )
+
+    code, text = command(f"{line} --tasks mine.npz --resume")
+    assert (code, "result is finished already" in text) == (0, True)
+    save_tasks(Path("others.npz"), sample_tasks(envs.make("maze15"), 6, 3))
+    code, text = command(f"{line} --tasks others.npz --resume")
+    assert code == 2
+    assert "result holds results of other settings: tasks_sha256" in text
 
     code, text = command(f"{line.replace('result', 'others')} --validation")
     assert code == 0, text
@@ -627,6 +669,7 @@ def test_a_continuous_world_from_data_to_release(
         demonstrators=of_single_subtasks,
     )
     monkeypatch.setattr(WORLDS, "find", {"kitchen": short}.__getitem__)
+    monkeypatch.setattr(WORLDS, "known", lambda name, where, flag="": {"kitchen": short}[name])
     line = (
         "pretrain --env kitchen --preset smoke --episodes 24 --holdout 8 --embed-dim 8 "
         "--num-layers 1 --steps 4 --batch-size 8 --part-size 4 --bucket 60 --eval-tasks 2 "

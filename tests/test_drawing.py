@@ -179,6 +179,36 @@ def test_an_adaptation_draws_into_its_own_folder(tmp_path: Path, grid_policy: Pa
         assert names(folder) == wanted
 
 
+def test_a_changed_picture_of_an_adaptation_is_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The others are drawn anew."""
+    drawing.draw_run(TINY, made_results(), tmp_path)
+    curve, prompts = tmp_path / "learning_curve.png", tmp_path / "prompts.png"
+    before = curve.read_bytes()
+    prompts.write_bytes(b"mine")
+    curve.unlink()
+    capsys.readouterr()
+    drawing.draw_run(TINY, made_results(), tmp_path)
+    assert (curve.read_bytes(), prompts.read_bytes()) == (before, b"mine")
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2
+    assert f"{prompts} is kept: it was changed, or not written by this command; move it" in lines[1]
+
+
+def test_goals_at_the_ends_of_the_numbers_are_drawn(
+    tmp_path: Path, save: Save, policy: Path
+) -> None:
+    results = mazes(policy)
+    goals = np.full_like(results.best["prompt.goals"], 1e18)
+    goals[..., 1] *= -1
+    parts = {**results.best, "prompt.goals": goals}
+    run = save("run", replace(results, choices=parts, best=parts))
+    main(PlotConfig(runs=(run,), out=tmp_path / "out", tasks=(1,)))
+    assert "tiny_prompts.png" in names(tmp_path / "out")
+    check_pictures(tmp_path / "out")
+
+
 def test_worlds_without_pictures_get_curves_only(tmp_path: Path, save: Save, policy: Path) -> None:
     run = save("run", mazes(policy, env="plain"))
     main(PlotConfig(runs=(run,), out=tmp_path / "out"))

@@ -18,6 +18,7 @@ from mgpo_jax.files import (
     has_work,
     hash_arrays,
     new_folder,
+    remove_leftovers,
     remove_unfinished,
     write_arrays,
     write_json,
@@ -35,8 +36,9 @@ def fail_in(folder: Path, keep: str = "") -> None:
     """Write a file and a finished piece of work, and then fail."""
     with new_folder(folder, keep) as place:
         (place / "file").write_text("content")
-        (place.parent / "work").mkdir()
-        write_arrays(place.parent / "work" / "piece.npz", {"a": np.ones(2)})
+        if keep:
+            (place.parent / keep).mkdir()
+            write_arrays(place.parent / keep / "piece.npz", {"a": np.ones(2)})
         raise ZeroDivisionError
 
 
@@ -70,6 +72,49 @@ def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
         (place / "new").write_text("")
     assert names(tmp_path) == ["folder"]
     assert names(tmp_path / "folder") == ["new"]
+
+
+def test_what_is_not_ours_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "folder.partial").mkdir()
+    (tmp_path / "folder.partial" / "thesis.txt").write_text("mine")
+    with (
+        pytest.raises(UsageError, match=r"thesis\.txt is in the way, which is no work of a command"),
+        new_folder(tmp_path / "folder"),
+    ):
+        pass
+    assert (tmp_path / "folder.partial" / "thesis.txt").read_text() == "mine"
+
+
+def test_leftovers_beside_a_finished_folder(tmp_path: Path) -> None:
+    """A process was killed right after it had made the folder."""
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder.partial" / "work").mkdir(parents=True)
+    write_arrays(tmp_path / "folder.partial" / "work" / "piece.npz", {"a": np.ones(2)})
+    remove_leftovers(tmp_path / "folder", keep="work")
+    assert names(tmp_path) == ["folder"]
+
+
+RACE = """
+import sys
+from pathlib import Path
+from mgpo_jax.claims import InUseError, claimed
+held = 0
+while held < 500:
+    try:
+        with claimed(Path(sys.argv[1])):
+            held += 1
+    except InUseError:
+        pass
+"""
+
+
+def test_processes_that_make_and_remove_one_folder(tmp_path: Path) -> None:
+    words = [sys.executable, "-c", RACE, str(tmp_path / "deep" / "folder")]
+    racers = [subprocess.Popen(words, stderr=subprocess.PIPE, text=True) for _ in range(2)]
+    for racer in racers:
+        _, err = racer.communicate(timeout=120)
+        assert (racer.returncode, err) == (0, "")
+    assert not (tmp_path / "deep" / "folder").exists()
 
 
 def test_finished_work_stays_after_a_failure(tmp_path: Path) -> None:

@@ -225,7 +225,7 @@ def test_own_tasks(command: Run, policy: Path) -> None:
     np.savez("mine.npz", start=[0], order=[4])
     done = command(line.replace("--out mine", "--out other"))
     assert done.code == 1
-    assert "order must have shape [1, 2], found [1]" in done.err
+    assert "order has shape [1], wanted [task 1, 2]" in done.err
 
 
 @pytest.mark.parametrize("name", ["collect", "pretrain --preset smoke"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -132,7 +133,10 @@ def test_damaged_network_settings(policy: Path, change: dict, says: str) -> None
             r"made.env is not a name that is allowed here, found '../../x'",
         ),
         ({"made": {"steps": 1.5}}, r"made.steps must be an integer, found 1.5"),
-        ({"sha256": "0"}, "config.json: sha256 is none"),
+        (
+            {"sha256": "0"},
+            "config.json: sha256 must be a SHA-256, 64 hexadecimal digits, found '0'",
+        ),
         ({"more": 1}, "has the unknown entry more"),
     ],
 )
@@ -218,7 +222,8 @@ def test_weights_of_a_foreign_tool(policy: Path) -> None:
 def test_a_policy_is_whole_or_absent(
     policy: Path, params: dict, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whether writing it breaks off in a new folder or in that of an older policy."""
+    """Where writing it breaks off, there is the policy of before or none."""
+    before = read_policy(policy)
 
     def stop(path: Path) -> str:
         raise KeyboardInterrupt
@@ -226,13 +231,68 @@ def test_a_policy_is_whole_or_absent(
     monkeypatch.setattr("mgpo_jax.policy_files.hash_file", stop)
     for folder in (policy, policy.with_name("new")):
         with pytest.raises(KeyboardInterrupt):
-            save_policy(folder, CONFIG, params, {})
-        with pytest.raises(UsageError, match="no policy in"):
-            read_policy(folder)
-    assert not policy.with_name("new").exists()
+            save_policy(folder, CONFIG, params, {"steps": 1})
+    assert [path.name for path in policy.parent.iterdir()] == ["policy"]
     monkeypatch.undo()
+    assert (read_policy(policy).made, read_policy(policy).sha256) == (before.made, before.sha256)
     save_policy(policy, CONFIG, params, {"steps": 1})
     assert read_policy(policy).made == {"steps": 1}
+
+
+def test_a_policy_keeps_the_files_beside_it(policy: Path, params: dict) -> None:
+    (policy / "README.md").write_text("a card")
+    (policy / "more").mkdir()
+    (policy / "more/tasks.npz").write_bytes(b"tasks")
+    link = policy.with_name("link")
+    link.symlink_to(policy)
+    for number, folder in enumerate((policy, link)):
+        save_policy(folder, CONFIG, params, {"steps": number})
+        assert read_policy(policy).made == {"steps": number}
+        assert (policy / "README.md").read_text() == "a card"
+        assert (policy / "more/tasks.npz").read_bytes() == b"tasks"
+    assert link.is_symlink()
+    assert {path.name for path in policy.parent.iterdir()} == {"policy", "link"}
+
+
+def test_two_policies_are_exchanged_whole(
+    policy: Path, params: dict, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before and after each renaming, one of the two is there."""
+    places = (policy, policy.with_name("policy.partial") / "before")
+    seen: list[dict] = []
+    rename = os.rename
+
+    def watched(source: Path, target: Path) -> None:
+        for step in (lambda: None, lambda: rename(source, target)):
+            step()
+            seen.append(next(read_policy(one).made for one in places if one.exists()))
+
+    monkeypatch.setattr("os.rename", watched)
+    save_policy(policy, CONFIG, params, {"steps": 1})
+    old, new = {"env": "maze15"}, {"steps": 1}
+    assert seen == [old, old, old, new]
+
+
+@pytest.mark.parametrize("exchanged", [False, True])
+def test_a_killed_exchange_of_policies_is_mended(
+    policy: Path, params: dict, exchanged: bool
+) -> None:
+    """A process was killed between two renamings, or before it removed the old policy."""
+    partial = policy.with_name("policy.partial")
+    partial.mkdir()
+    (partial / ".lock").touch()
+    (policy / "card.md").write_text("mine")
+    policy.rename(partial / "before")
+    if exchanged:
+        (policy.parent / "made").mkdir()
+        save_policy(policy.parent / "made/new", CONFIG, params, {"steps": 1})
+        (policy.parent / "made/new").rename(policy)
+        (policy.parent / "made").rmdir()
+        (policy / "card.md").write_text("mine")
+    save_policy(policy, CONFIG, params, {"steps": 2})
+    assert read_policy(policy).made == {"steps": 2}
+    assert (policy / "card.md").read_text() == "mine"
+    assert [path.name for path in policy.parent.iterdir()] == ["policy"]
 
 
 def test_weights_that_are_not_finite_are_not_written(tmp_path: Path, params: dict) -> None:

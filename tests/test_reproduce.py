@@ -78,24 +78,29 @@ def test_table5_from_data_to_table(tiny: Path, monkeypatch: pytest.MonkeyPatch) 
 
 def test_a_stopped_training_goes_on(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[PretrainConfig] = []
-    monkeypatch.setattr(ablations, "train", asked.append)
+    monkeypatch.setattr(ablations, "train", lambda settings, go_on: asked.append(settings))
     config = ReproduceConfig(what="figure8", steps=2)
     policy = ablations.trained(config, "astar4", "astar4", max_prompt_length=10)
     policy.parent.mkdir(parents=True)
+    (policy.parent / "config.json").touch()
     ablations.trained(config, "astar4", "astar4", max_prompt_length=10)
-    assert [one.resume for one in asked] == [False, True]
+    assert [one.resume for one in asked] == [False, True]  # it goes on where it was
     for one in asked:
         assert (one.out, one.max_prompt_length) == (policy.parent, 10)
         assert (one.data.demonstrator, one.train.steps) == ("astar4", 2)
     policy.mkdir()
     ablations.trained(config, "astar4", "astar4", max_prompt_length=10)
-    assert len(asked) == 2
+    assert len(asked) == 3  # the policy is only half there
+    for name in ("policy/config.json", "policy/weights.npz", "training.png"):
+        (policy.parent / name).touch()
+    ablations.trained(config, "astar4", "astar4", max_prompt_length=10)
+    assert len(asked) == 3
 
 
 def test_heads_differ_in_nothing_else(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[PretrainConfig] = []
     adapted: list[Path] = []
-    monkeypatch.setattr(ablations, "train", asked.append)
+    monkeypatch.setattr(ablations, "train", lambda settings, go_on: asked.append(settings))
     monkeypatch.setattr(
         ablations, "adapted", lambda config, policy, folders: adapted.extend(folders)
     )

@@ -249,8 +249,12 @@ DAMAGES |= {
         r"best\.prompt\.goals must hold numbers, found complex128",
     ),
     "goals far away": (
-        rewrite("results.npz", best__prompt__goals=np.full((*TWO, 3, 2), 1e10)),
-        r"best\.prompt\.goals holds 1e\+10 at seed 0, task 0, round 0, slot 0, number 0, must be",
+        rewrite("results.npz", best__prompt__goals=np.full((*TWO, 3, 2), 1e19)),
+        r"best\.prompt\.goals holds 1e\+19 at seed 0, task 0, round 0, slot 2, number 0, must be",
+    ),
+    "no goals": (
+        rewrite("results.npz", choice__prompt__goals=np.full((*TWO, 3, 2), np.nan)),
+        r"choice\.prompt\.goals holds nan at seed 0, task 0, round 0, slot 2, number 0, must be",
     ),
     "prompts without a goal": (
         rewrite("results.npz", best__prompt__mask=np.zeros((*TWO, 3), bool)),
@@ -297,6 +301,20 @@ def test_broken_results_are_named(tmp_path: Path, name: str) -> None:
     with pytest.raises(DataError, match=message) as caught:
         load_results(folder)
     assert "\n" not in str(caught.value)
+
+
+def test_what_is_not_used_may_hold_anything(tmp_path: Path) -> None:
+    """A method of a user need not care for the slots that it masks, nor for numbers of its own."""
+    results = made_results()
+    unused = ~results.best["prompt.mask"][..., None]
+    goals = np.where(unused, np.float32(np.nan), results.best["prompt.goals"])
+    goals[unused[..., 0], 1] = np.inf
+    own = np.full((2, 2, 20, 4), -np.inf)
+    parts = {**results.best, "prompt.goals": goals, "score": own}
+    made = replace(results, choices=parts, best=parts)
+    loaded = load_results(save(tmp_path / "run", made))
+    assert_equal(loaded, made)
+    assert np.isfinite(loaded.best_goals(0, 0)).all()
 
 
 def test_tasks_of_results_are_checked_like_those_of_a_user(tmp_path: Path) -> None:
@@ -358,6 +376,25 @@ def test_a_policy_is_found_where_it_was_moved_with_its_results(
     with pytest.raises(
         DataError, match=r"the policy of .* tiny ucb is not in .*; give .* --policy"
     ):
+        load_policy_of(loaded, TINY)
+
+
+def test_a_damaged_policy_does_not_hide_a_sound_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beside the moved results lies a damaged one, at the old place the sound one."""
+    monkeypatch.chdir(tmp_path)
+    sha256 = policy_in(Path("policy"), 0)
+    results = made_results(config={"env": "tiny", "method": "ucb", "policy": "policy"})
+    save_results(Path("runs/one"), with_summary(results, sha256))
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "runs").rename(tmp_path / "elsewhere/runs")
+    policy_in(tmp_path / "elsewhere/policy", 0)
+    (tmp_path / "elsewhere/policy/weights.npz").write_bytes(b"")
+    loaded = load_results(tmp_path / "elsewhere/runs/one")
+    assert load_policy_of(loaded, TINY).folder.resolve() == (tmp_path / "policy").resolve()
+    (tmp_path / "policy/config.json").write_text("{")
+    with pytest.raises(DataError, match=r"elsewhere/.*weights\.npz is missing, truncated"):
         load_policy_of(loaded, TINY)
 
 

@@ -19,6 +19,7 @@ from pydantic import BaseModel
 
 from envs.errors import DataError
 from envs.registry import WORLDS
+from mgpo_jax.files import write_arrays
 from mgpo_jax.schema import (
     STRICT,
     ArrayField,
@@ -191,6 +192,32 @@ def test_bombs_are_not_unpacked(path: Path) -> None:
         read_arrays(path, {"rows": ArrayField(("step",), "integers")})
 
 
+def test_an_array_of_an_expected_size_is_no_bomb(path: Path) -> None:
+    """Frames in which nearly nothing happens deflate to less than a hundredth."""
+    frames = np.zeros((80_000, 84, 84), np.uint8)
+    frames[:, 5, 5] = 7
+    write_arrays(path, {"obs": frames})
+    assert path.stat().st_size * 100 < frames.nbytes
+    fields = {"obs": ArrayField(("step", 84, 84), "uint8")}
+    for sizes in (None, {"step": range(1, 2**31)}):
+        with pytest.raises(DataError, match="claims 538 MB of arrays in a file of"):
+            read_arrays(path, fields, sizes)
+    with pytest.raises(DataError, match=r"wanted \[step 79999, 84, 84\]"):
+        read_arrays(path, fields, {"step": 79_999})
+    found = read_arrays(path, fields, {"step": 80_000})["obs"]
+    assert np.array_equal(found, frames)
+
+
+def test_any_value(path: Path) -> None:
+    """Also one that does not fit into the dtype of the field."""
+    np.savez(path, goal=[[np.nan, -np.inf], [0, 1e300]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        field = ArrayField(("task", 2), "float32", any_value=True)
+        found = read_arrays(path, {"goal": field})["goal"]
+    np.testing.assert_array_equal(found, np.float32([[np.nan, -np.inf], [0, np.inf]]))
+
+
 @pytest.mark.parametrize("content", [b"", b"no", b"\x93NUMPY", b"PK\x03\x04" + bytes(40)])
 def test_what_is_no_npz(path: Path, content: bytes) -> None:
     path.write_bytes(content)
@@ -302,7 +329,7 @@ def test_documents_come_back(tmp_path: Path) -> None:
 def test_names_in_files_import_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A place is accepted once a user has named it, under its place and under the record's name."""
     (tmp_path / "mine_only.py").write_text(
-        "from envs.registry import World\nWORLD = World(name='mine', make=lambda: None)\n"
+        "from envs.registry import World\nWORLD = World(name='mine_only_world', make=lambda: None)\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(WORLDS, "_loaded", dict(WORLDS._loaded))
@@ -310,9 +337,10 @@ def test_names_in_files_import_nothing(tmp_path: Path, monkeypatch: pytest.Monke
         DataError, match=r"^F names the world 'mine_only:WORLD'.* --env mine_only:W"
     ):
         WORLDS.known("mine_only:WORLD", "F", "--env")
-    with pytest.raises(DataError, match=r"^F: unknown world 'mine' .*; give its place with --env"):
-        WORLDS.known("mine", "F", "--env")
+    unknown = r"^F: unknown world 'mine_only_world' .*; give its place with --env"
+    with pytest.raises(DataError, match=unknown):
+        WORLDS.known("mine_only_world", "F", "--env")
     world = WORLDS.find("mine_only:WORLD")
     assert WORLDS.known("mine_only:WORLD", "F", "--env") is world
-    assert WORLDS.known("mine", "F", "--env") is world
+    assert WORLDS.known("mine_only_world", "F", "--env") is world
     assert WORLDS.known("maze15", "F", "--env").name == "maze15"

@@ -198,3 +198,17 @@ def test_ranges_of_training(name: str, value: Any):
     check_settings(TrainConfig())
     with pytest.raises(UsageError, match=f"{flag(name)} must be"):
         check_settings(replace(TrainConfig(), **{name: value}))
+
+
+def test_numbers_of_numpy_are_numbers() -> None:
+    """A sweep over an arange is not refused for its types."""
+
+    @dataclass(frozen=True)
+    class Swept:
+        num: Count = 1
+        rate: Positive = 0.1
+
+    numpy: Any = Swept(num=np.int64(64), rate=np.float32(0.5))  # type: ignore[arg-type]
+    check_settings(numpy)
+    with pytest.raises(UsageError, match="--num must be at least 1, found 0"):
+        check_settings(replace(numpy, num=np.int64(0)))

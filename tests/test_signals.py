@@ -79,6 +79,34 @@ with signals.watched(), signals.asked_to_stop():
     assert (code, out) == (130, "still there\n")
 
 
+def test_nobody_reads_the_messages_any_more() -> None:
+    """As when the program behind a pipe has ended; the signal counts all the same."""
+    code, out, _ = outcome(
+        """
+reading, writing = os.pipe()
+os.close(reading)
+os.dup2(writing, 2)
+with signals.watched(), signals.farewell(lambda: "stopped"):
+    send(signal.SIGTERM)
+    print("not reached", flush=True)
+"""
+    )
+    assert (code, out) == (143, "")
+
+
+def test_what_the_parent_ignores_stays_ignored() -> None:
+    """Shells start background jobs of scripts so."""
+    code, out, _ = outcome(
+        """
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+with signals.watched():
+    send(signal.SIGINT)
+    print("still there", flush=True)
+"""
+    )
+    assert (code, out) == (0, "still there\n")
+
+
 def test_the_main_thread_need_not_come_back() -> None:
     """A compiled program keeps it busy for minutes; here a lock that nobody opens does."""
     process = subprocess.Popen(

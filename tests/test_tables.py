@@ -79,7 +79,9 @@ def test_published_results_have_rows(folder: Path) -> None:
     assert ("[" in found["IQM [95 %]"]) != one_seed
     as_printed = folder.name == "ucb-as-printed"
     assert (found["settings"] == "keep_rewarded=false") == as_printed
-    assert (found["paper: final"] == "") == as_printed
+    released = "policy" not in row.settings
+    assert released == ("ablations" not in folder.parts)
+    assert (found["paper: final"] == "") == (as_printed or not released)
 
 
 def test_the_published_table_is_that_of_the_results(
@@ -101,7 +103,7 @@ def test_a_table_needs_no_jax() -> None:
 def test_a_policy_that_was_not_released_is_stated() -> None:
     row = read_row(RESULTS / "ablations/kitchen/mixture/ucb")
     assert row.settings == {"policy": "2d3d3ab0106b"}
-    assert cells(row)["paper: final"] == "0.63 ± 0.02"  # beside a stated policy
+    assert cells(row)["paper: final"] == ""  # which is that of the released policy
 
 
 @pytest.mark.parametrize(
@@ -109,12 +111,12 @@ def test_a_policy_that_was_not_released_is_stated() -> None:
     [
         ({}, {}, True),
         ({"seed": 4}, {"seed": "4"}, True),
-        ({"policy": "runs/mine"}, {"policy": "runs/mine"}, True),
+        ({"policy": "runs/mine"}, {"policy": "runs/mine"}, False),
         ({"eval_episodes": 3}, {"eval_episodes": "3"}, False),
         ({"eval_every": 5}, {"eval_every": "5"}, False),
         ({"hyper": {"max_goals": None, "keep_rewarded": True, "c": 2.0}}, {"c": "2"}, False),
         ({"hyper": {"max_goals": 7, "c": 1}}, {"max_goals": "7"}, False),
-        ({"policy": "x" * 300}, {"policy": "x" * 28 + "..." + "x" * 28}, True),
+        ({"policy": "x" * 300}, {"policy": "x" * 28 + "..." + "x" * 28}, False),
         ({"figures": False, "out": "elsewhere", "debug": True}, {}, True),
     ],
 )
@@ -228,6 +230,11 @@ CONTRADICTIONS = {
     "num_episodes": 99,
     "regret": 0.0,
     "regret_after_40": 0.1,
+    "regret_std_over_seeds": 0.0,
+    "optimal_return": -0.205,
+    "solved_optimally": 0.99,
+    "unsolvable_tasks": 51,
+    "best_episode_return": 0.9,
 }
 
 
@@ -236,6 +243,34 @@ def test_a_summary_of_other_results_is_refused(copied: Path, name: str) -> None:
     value = CONTRADICTIONS[name]
     change(copied / "summary.json", **{name: value})
     with pytest.raises(DataError, match=rf"summary\.json: {name} is .*, by results\.npz it is"):
+        read_row(copied)
+
+
+def test_an_optimum_is_that_of_the_results(copied: Path) -> None:
+    """A regret that fits a false optimum is refused as well."""
+    summary = read_summary(copied)
+    assert summary["optimal_return"] is not None
+    change(
+        copied / "summary.json",
+        optimal_return=summary["final_return"],
+        regret=0.0,
+        regret_after_40=0.0,
+        solved_optimally=1.0,
+    )
+    with pytest.raises(DataError, match=r"optimal_return is .*, by results\.npz it is -0\.072"):
+        read_row(copied)
+
+
+def test_the_share_solved_allows_for_tasks_that_nobody_can_solve(copied: Path) -> None:
+    share = read_summary(copied)["solved_optimally"]
+    assert share == pytest.approx(0.73, abs=0.01)
+    change(copied / "summary.json", unsolvable_tasks=2, solved_optimally=share - 0.04)
+    assert cells(read_row(copied))["solved optimally"] == "69 % (2 tasks unsolvable)"
+    change(copied / "summary.json", solved_optimally=share - 0.05)
+    with pytest.raises(DataError, match=r"solved_optimally is 0\.6766"):
+        read_row(copied)
+    change(copied / "summary.json", unsolvable_tasks=40, solved_optimally=share)
+    with pytest.raises(DataError, match=r"solved_optimally is .*, by results\.npz it is 0\.2"):
         read_row(copied)
 
 
@@ -250,7 +285,12 @@ def test_optimum_and_solved_are_known_together(copied: Path) -> None:
         ("optimal_return", "regret", "regret_after_40", "regret_std_over_seeds")
     )
     change(copied / "summary.json", **unknown)
-    with pytest.raises(DataError, match=r"regret_after_40|solved_optimally needs optimal_return"):
+    with pytest.raises(DataError, match=r"optimal_return is unknown, by results\.npz it is"):
+        read_row(copied)
+    with np.load(copied / "results.npz") as file:
+        arrays = {name: array for name, array in file.items() if name != "optimal_returns"}
+    np.savez(copied / "results.npz", **arrays)
+    with pytest.raises(DataError, match=r"solved_optimally is 0\.7266.*, .* it is unknown"):
         read_row(copied)
     change(copied / "summary.json", solved_optimally=None)
     assert cells(read_row(copied))["solved optimally"] == ""

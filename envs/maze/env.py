@@ -106,9 +106,9 @@ class MazeRunner(Environment):
         """Steps from the start to the goal; -1 where it is cut off."""
         return distances(task.maze == 0, jnp.asarray(self.start))[tuple(task.goal)]
 
-    def _shortest_paths(self, tasks: MazeTask) -> list[int]:
-        batch = jax.tree.map(jnp.asarray, tasks)
-        return jax.jit(jax.vmap(self._shortest_path))(batch).tolist()
+    @partial(jax.jit, static_argnums=0)  # compiled once for both checks of the same tasks
+    def _shortest_paths(self, tasks: MazeTask) -> Int[Array, "N"]:
+        return jax.vmap(self._shortest_path)(tasks)
 
     def fingerprint(self, task: MazeTask) -> Int[Array, "F"]:
         """The walls: a test maze must not occur in training with any goal."""
@@ -130,12 +130,12 @@ class MazeRunner(Environment):
                 raise ValueError(f"task {index}: goal ({row}, {column}) is not a free cell")
             if (row, column) == start:
                 raise ValueError(f"task {index}: goal ({row}, {column}) is the start cell")
-        for index, steps in enumerate(self._shortest_paths(tasks)):
+        for index, steps in enumerate(self._shortest_paths(tasks).tolist()):
             if steps < 0:
                 raise ValueError(f"task {index}: no free path leads from the start to the goal")
 
     def check_solvable(self, tasks: MazeTask) -> None:
-        for index, steps in enumerate(self._shortest_paths(tasks)):
+        for index, steps in enumerate(self._shortest_paths(tasks).tolist()):
             if steps > self.horizon:
                 raise ValueError(
                     f"task {index}: the goal is {steps} steps away, an episode of {self.name} has "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -47,6 +48,21 @@ def read_metrics(path: Path, names: Collection[str] = ()) -> list[dict[str, Any]
         row["step"] = last = int(step)
     if missing := [name for name in names if name not in rows[-1]]:
         raise DataError(f"{path}, line {len(rows)} lacks {', '.join(missing)}; {RESUME}")
+    return rows
+
+
+def salvaged_rows(path: Path, last_step: int) -> list[dict[str, float]]:
+    """The rows of a ``metrics.jsonl`` up to a step; damaged ones are left out, with a line on stderr."""
+    rows, lost = [], 0
+    for line in path.read_bytes().splitlines() if path.is_file() else ():
+        try:
+            row = json.loads(line)
+            if row["step"] <= last_step:
+                rows.append({str(name): value for name, value in row.items()})
+        except (KeyError, RecursionError, TypeError, ValueError):
+            lost += 1
+    if lost:
+        print(f"{path}: {lost} rows are damaged and left out", file=sys.stderr)
     return rows
 
 

@@ -26,19 +26,22 @@ def load_policy_of(results: Results, world: World, override: Path | None = None)
       override: folder of the policy (default: the first of the places where it may lie by now).
 
     Raises:
-      DataError: if it is at none of its places, there are other weights by now, or it does not fit.
+      DataError: if it is at none of its places, or only damaged, with other weights or unfit for the world.
     """
     places = [override] if override is not None else places_of_policy(results)
     there = [place for place in places if (place / CONFIG).is_file()] or places[:1]
     if override is None and not (there[0] / CONFIG).is_file():
         listed = ", ".join(str(place) for place in places)
         raise DataError(f"the policy of {_told(results)} is not in {listed}; {GIVE}")
+    faults: list[DataError] = []
     for place in there:
-        policy = load_policy(world, place)
-        if policy.sha256 == results.summary.get("policy_sha256", policy.sha256):
+        try:
+            policy = load_policy(world, place)
+            check_weights(results, policy, f"{GIVE}, or {ADAPT_AGAIN}")
             return policy
-    check_weights(results, policy, f"{GIVE}, or {ADAPT_AGAIN}")
-    return policy
+        except DataError as error:  # the policy may lie at the next place
+            faults.append(error)
+    raise faults[0]
 
 
 def places_of_policy(results: Results) -> list[Path]:

@@ -35,6 +35,7 @@ from mgpo_jax.files import new_folder, write_arrays, write_json
 from mgpo_jax.methods import METHODS
 from mgpo_jax.runner import Outcome, Reached
 from mgpo_jax.schema import (
+    LARGEST,
     STRICT,
     ArrayField,
     Json,
@@ -64,7 +65,6 @@ AXES = {
 }  # fmt: skip
 """Axes of the arrays by a letter, with their names in messages."""
 SIZES: Sizes = dict.fromkeys(("seed", "task", "episode", "round", "judgement"), range(1, 2**31))
-FAR = 1e9  # no coordinate of a goal is farther from 0
 
 
 def _field(axes: str, dtype: str, **more: Any) -> ArrayField:
@@ -73,27 +73,26 @@ def _field(axes: str, dtype: str, **more: Any) -> ArrayField:
     return ArrayField(tuple(shape), dtype, **more)
 
 
-_GOALS = {"low": -FAR, "high": FAR}
 FIELDS = {
     "returns": _field("SNE", "float32"),
     "eval_episodes": _field("C", "int64", low=1),
     "eval_returns": _field("SNC", "float32"),
     "optimal_returns": _field("N", "float32", required=False),
-    "task_goals": _field("NG", "float32", required=False, **_GOALS),
+    "task_goals": _field("NG", "float32", required=False),
     "lengths": _field("SNE", "integers", required=False, low=0),
     "keys": _field("SNE2", "uint32", required=False),
     "actions": _field("SNET*", "numbers", required=False),
     "reached_counts": _field("SNE", "int32", required=False, low=0),
     "reached_steps": _field("L", "integers", required=False, low=0),
     "reached_index": _field("L", "integers", required=False, low=0),
-    "reached_table": _field("UG", "float32", required=False, **_GOALS),
+    "reached_table": _field("UG", "float32", required=False),
 }
 PART_FIELDS = {
-    "prompt.goals": _field("SNRPG", "float32", **_GOALS),
+    "prompt.goals": _field("SNRPG", "float32", any_value=True),  # see ``_check_prompts``
     "prompt.mask": _field("SNRP", "bool"),
 }
 """Of the parts of choices that are known; any other is ``OTHER_PART``."""
-OTHER_PART = _field("SNR*", "anything")
+OTHER_PART = _field("SNR*", "anything", any_value=True)
 REACHED = ("reached_counts", "reached_steps", "reached_index", "reached_table")
 PARTS = frozenset({"choices", "lengths", "keys", "actions", "reached"})
 """What ``load_results`` can leave out."""
@@ -255,11 +254,14 @@ def _parts(choice: Any) -> dict[str, np.ndarray]:
 def save_results(folder: Path, results: Results) -> None:
     """Write results to a new folder, which appears when all of it is there."""
     with new_folder(folder) as place:
-        write_results(place, results, folder)
+        write_results(place, results, folder, provenance())
 
 
-def write_results(place: Path, results: Results, folder: Path) -> None:
-    """Write the files of results into a place that becomes ``folder``."""
+def write_results(place: Path, results: Results, folder: Path, meta: Mapping[str, Any]) -> None:
+    """Write the files of results into a place that becomes ``folder``.
+
+    ``meta`` says how and with what they were made, as ``provenance`` does.
+    """
     arrays = {
         "returns": results.returns,
         "eval_episodes": results.eval_episodes,
@@ -282,7 +284,7 @@ def write_results(place: Path, results: Results, folder: Path) -> None:
     save_tasks(place / TASKS, results.task_set)
     write_json(place / CONFIG, results.config)
     places = policy_places(folder, results.config.get("policy"))
-    write_json(place / META, {"format": FORMAT, **provenance(), "policy_places": places})
+    write_json(place / META, {**meta, "format": FORMAT, "policy_places": places})
     write_json(place / SUMMARY, results.summary)
 
 
@@ -462,18 +464,39 @@ def _check_values(arrays: Mapping[str, np.ndarray], path: Path) -> None:
             f"{path}: eval_episodes must ascend from 1 to at most {num}, found "
             f"{shown(judged.tolist())}; {ADAPT_AGAIN}"
         )
-    for name in ("choice.prompt.mask", "best.prompt.mask"):
-        if name in arrays and not (some := arrays[name].any(axis=-1)).all():
-            seed, task, round_ = (int(axis) for axis in np.argwhere(~some)[0])
-            raise DataError(
-                f"{path}: {name} leaves no goal at seed {seed}, task {task}, round {round_}; {ADAPT_AGAIN}"
-            )
+    for prefix in ("choice.", "best."):
+        _check_prompts(_with_prefix(arrays, prefix), prefix, path)
     lengths, actions = arrays.get("lengths"), arrays.get("actions")
     if lengths is not None and actions is not None and lengths.max() > actions.shape[3]:
         raise DataError(
             f"{path}: lengths holds {lengths.max()}, there are actions of {actions.shape[3]} steps; "
             + ADAPT_AGAIN
         )
+
+
+def _check_prompts(parts: Mapping[str, np.ndarray], prefix: str, path: Path) -> None:
+    """Raise ``DataError`` for a prompt without a goal, or with one that no network can read.
+
+    Slots that are masked may hold anything.
+    """
+    goals, mask = parts.get("prompt.goals"), parts.get("prompt.mask")
+    if mask is not None and not (some := mask.any(axis=-1)).all():
+        place = _place(~some, "SNR")
+        raise DataError(f"{path}: {prefix}prompt.mask leaves no goal at {place}; {ADAPT_AGAIN}")
+    if goals is None or mask is None:
+        return
+    wrong = mask[..., None] & ~(np.abs(goals) <= LARGEST)  # which NaN is neither
+    if wrong.any():
+        raise DataError(
+            f"{path}: {prefix}prompt.goals holds {shown(float(goals[wrong][0]))} at "
+            f"{_place(wrong, 'SNRPG')}, must be from {-LARGEST:g} to {LARGEST:g}; {ADAPT_AGAIN}"
+        )
+
+
+def _place(where: np.ndarray, axes: str) -> str:
+    """The first place where something is true, with its axes as letters, in a message."""
+    named = zip(axes, np.argwhere(where)[0], strict=True)
+    return ", ".join(f"{AXES[axis]} {int(number)}" for axis, number in named)
 
 
 def _with_prefix(arrays: Mapping[str, Any], prefix: str) -> dict[str, Any]:

@@ -10,18 +10,21 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import sys
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from envs.errors import DataError, UsageError, shown
+from envs.errors import DataError, UsageError, printable, shown
 from experiments.store.settings import PretrainConfig, saved_pretraining, training_settings
 from mgpo_jax.claims import LOCK, check_place
 from mgpo_jax.files import TEMPORARY, write_json
 from mgpo_jax.schema import Json, read_document
 
 CONFIG, META, CHECKPOINTS, POLICY = "config.json", "meta.json", "checkpoints", "policy"
+PICTURE = "training.png"
 OLD_PARTIAL = "config.json.partial"  # what older versions were writing when they were killed
 ROOM = 32 << 20  # bytes that must be free before a training starts: a few small checkpoints
 
@@ -33,7 +36,9 @@ def has_begun(folder: Path) -> bool:
 
 def is_finished(folder: Path) -> bool:
     """Whether a run has trained to its end and written its policy."""
-    return all((folder / POLICY / name).is_file() for name in ("config.json", "weights.npz"))
+    # The picture is the last thing that is written.
+    names = (f"{POLICY}/config.json", f"{POLICY}/weights.npz", PICTURE)
+    return all(os.path.isfile(folder / name) for name in names)
 
 
 def check_start(config: PretrainConfig) -> None:
@@ -49,6 +54,7 @@ def check_start(config: PretrainConfig) -> None:
             raise UsageError(
                 f"{folder} exists already; continue it with --resume, or choose another with --out"
             )
+        check_settings(config)
         if (folder / CHECKPOINTS).exists() and not (folder / CHECKPOINTS).is_dir():
             raise DataError(
                 f"{folder / CHECKPOINTS} is no folder; remove it to train from the first step"
@@ -70,7 +76,10 @@ def _holds_nothing(folder: Path) -> bool:
 
 def identity(config: PretrainConfig, dataset_sha256: str) -> str:
     """A hash of everything that determines the weights of a run, except for the machine."""
-    text = json.dumps([training_settings(config), dataset_sha256], sort_keys=True)
+    usual = training_settings(PretrainConfig())
+    # Those that have their defaults are left out, so that settings which are added later change nothing.
+    settings = {k: v for k, v in training_settings(config).items() if v != usual[k]}
+    text = json.dumps([settings, dataset_sha256], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
@@ -81,29 +90,31 @@ def begin(config: PretrainConfig, meta: dict[str, Any]) -> None:
     write_json(config.folder / CONFIG, config)
 
 
-def check_same(config: PretrainConfig, meta: dict[str, Any]) -> None:
-    """Check that a run which is resumed ends as it would have without a stop.
-
-    A line on stderr says so where only the last bits of the result may differ.
-
-    Raises:
-      UsageError: if it was started with other settings.
-      DataError: if it was started on another dataset.
-    """
+def check_settings(config: PretrainConfig) -> None:
+    """Raise ``UsageError`` if a run that is resumed was started with other settings."""
     folder = config.folder
     before = training_settings(saved_pretraining(folder / CONFIG))
-    now = training_settings(config)
-    if changed := changes(before, now):
+    if changed := changes(before, training_settings(config)):
         raise UsageError(
             f"{folder} was started with other settings: {changed}; give the same ones, or start a new run "
             "with --out"
         )
+
+
+def check_same(config: PretrainConfig, meta: dict[str, Any]) -> None:
+    """Check that a run which is resumed learns from the same dataset as before.
+
+    A line on stderr says so where other devices or versions may change the last bits of the result.
+
+    Raises:
+      DataError: if it was started on another dataset.
+    """
+    folder = config.folder
     if not (folder / META).is_file():
         write_json(folder / META, meta)
         return
-    saved = read_document(
-        folder / META, dict[str, Json], f"remove {folder / META}, and it is written again"
-    )
+    mend = f"remove {folder / META}, and it is written again"
+    saved = read_document(folder / META, dict[str, Json], mend)
     hash_before, hash_now = saved.get("dataset_sha256"), meta["dataset_sha256"]
     if hash_before not in (None, hash_now):
         raise DataError(
@@ -131,8 +142,10 @@ def say_what_differs(saved: dict[str, Any], now: dict[str, Any], what: str) -> N
       what: the work, for the message.
     """
     differs = []
-    if isinstance(saved.get("devices"), list) and len(saved["devices"]) != len(now["devices"]):
-        differs.append(f"{len(saved['devices'])} devices (now {len(now['devices'])})")
+    if isinstance(saved.get("devices"), list):
+        devices, devices_now = _counted(saved["devices"]), _counted(now["devices"])
+        if devices != devices_now:
+            differs.append(f"{devices} (now {devices_now})")
     if isinstance(saved.get("versions"), dict):
         versions = now["versions"]
         differs += [
@@ -143,3 +156,9 @@ def say_what_differs(saved: dict[str, Any], now: dict[str, Any], what: str) -> N
     if differs:
         text = f"{what} was begun with {', '.join(differs)}: the result may differ in its last bits"
         print(text, file=sys.stderr)
+
+
+def _counted(devices: Sequence[Any]) -> str:
+    """Devices by their kind, such as ``2 x TFRT_CPU``."""
+    kinds = Counter(printable(re.sub(r"[_:]\d+$", "", str(device))) for device in devices)
+    return ", ".join(f"{num} x {kind}" for kind, num in sorted(kinds.items()))

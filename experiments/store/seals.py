@@ -61,9 +61,14 @@ def is_sealed(content: bytes, suffix: str) -> bool:
     return at >= 0 and sealed(content[:at] + end, suffix) == content
 
 
+def is_foreign(path: Path) -> bool:
+    """Whether something is there that no command wrote as it is."""
+    return os.path.lexists(path) and not _is_ours(path)
+
+
 def check_replaceable(paths: Iterable[Path], *ways_out: str) -> None:
     """Raise ``UsageError`` with the ways out if files are there that no command wrote as they are."""
-    foreign = [str(path) for path in paths if os.path.lexists(path) and not _is_ours(path)]
+    foreign = [str(path) for path in paths if is_foreign(path)]
     if foreign:
         more = f" and {len(foreign) - 3} more" if len(foreign) > 3 else ""
         raise UsageError(

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from pydantic import BaseModel
 
@@ -32,6 +32,20 @@ class _Begun(BaseModel):
 
     settings: dict[str, Json]
     meta: dict[str, Json]
+    """Of the process that began it."""
+    resumed: list[Json] = []
+    """Of those that went on with it."""
+
+
+class Work(NamedTuple):
+    """What long work needs."""
+
+    place: Path
+    """Where to write the result."""
+    journal: Journal
+    """Where finished pieces are kept."""
+    meta: dict[str, Any]
+    """How and with what the result is made, for its ``meta.json``."""
 
 
 @contextmanager
@@ -42,7 +56,7 @@ def long_work(
     resume: bool,
     wait: bool = False,
     go_on: str = "continue with --resume",
-) -> Iterator[tuple[Path, Journal]]:
+) -> Iterator[Work]:
     """A place to write the result to, and a journal of finished pieces.
 
     Args:
@@ -59,28 +73,38 @@ def long_work(
     """
     pieces = partial_name(folder) / PIECES
     with new_folder(folder, keep=PIECES, wait=wait) as place:
-        if has_work(pieces):
-            if not resume:
-                raise UsageError(
-                    f"{pieces.parent} holds unfinished work; continue it with --resume, or remove it"
-                )
-            _check_same(pieces, settings, meta)
-            print(f"going on with the unfinished work in {pieces.parent}", file=sys.stderr)
-        journal = Journal(pieces)
-        write_json(pieces / SETTINGS, {"settings": settings, "meta": meta})
+        if has_work(pieces) and not resume:
+            raise UsageError(
+                f"{pieces.parent} holds unfinished work; continue it with --resume, or remove it"
+            )
+        journal, made = open_journal(pieces, settings, meta)
         with farewell(lambda: _farewell(pieces, go_on)):
-            yield place, journal
+            yield Work(place, journal, made)
 
 
-def _check_same(pieces: Path, settings: Mapping[str, Any], meta: Mapping[str, Any]) -> None:
-    """Raise ``UsageError`` if unfinished work was begun with other settings."""
-    mend = f"remove {pieces.parent} and start again"
-    saved: _Begun = read_document(pieces / SETTINGS, _Begun, mend)
-    if changed := changes(saved.settings, to_json(settings)):
-        raise UsageError(
-            f"{pieces.parent} was begun with other settings: {changed}; give the same ones, or remove it"
-        )
-    say_what_differs(saved.meta, dict(meta), str(pieces.parent))
+def open_journal(
+    pieces: Path, settings: Mapping[str, Any], meta: Mapping[str, Any]
+) -> tuple[Journal, dict[str, Any]]:
+    """The journal of work that is begun, or of unfinished work, and how and with what all of it is made.
+
+    Raises:
+      UsageError: if unfinished work was begun with other settings.
+    """
+    begun = _Begun(settings=to_json(settings), meta=to_json(meta))
+    if has_work(pieces):
+        mend = f"remove {pieces} and start again"
+        saved: _Begun = read_document(pieces / SETTINGS, _Begun, mend)
+        if changed := changes(saved.settings, begun.settings):
+            raise UsageError(
+                f"{pieces} was begun with other settings: {changed}; give the same ones, or remove it"
+            )
+        say_what_differs(saved.meta, begun.meta, str(pieces))
+        print(f"going on with the unfinished work in {pieces}", file=sys.stderr)
+        begun = saved.model_copy(update={"resumed": [*saved.resumed, begun.meta]})
+    journal = Journal(pieces)
+    write_json(pieces / SETTINGS, begun.model_dump())
+    made = {**begun.meta, "settings": begun.settings}
+    return journal, {**made, "resumed": begun.resumed} if begun.resumed else made
 
 
 def _farewell(pieces: Path, go_on: str) -> str:
