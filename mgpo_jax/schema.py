@@ -549,7 +549,8 @@ def _check_unpacked_size(
 
 def _is_expected(field: ArrayField, sizes: Sizes) -> bool:
     """Whether the sizes of all axes of an array are known before its file is opened."""
-    return all(isinstance(axis, int) or isinstance(sizes.get(axis), int) for axis in field.shape)
+    known = {name for name, size in sizes.items() if isinstance(size, int)}
+    return all(isinstance(axis, int) or axis in known for axis in field.shape)
 
 
 def _read_member(

@@ -160,7 +160,7 @@ def test_unexpected_errors_are_one_line(command: Run, monkeypatch: pytest.Monkey
     monkeypatch.setattr(envs, "make", lambda name: 1 / 0)
     code, text = command("collect")
     assert code == 1
-    assert text.startswith("error: ZeroDivisionError")
+    assert text.startswith("error: something went wrong that was not foreseen: division by zero; ")
     assert "--debug" in text
     assert "Traceback" not in text
 
@@ -447,7 +447,7 @@ def test_a_loss_that_is_not_finite_stops_the_training(
     monkeypatch.setattr(Trainer, "step", broken)
     code, text = command(f"{TINY} --out broken")
     assert code == 1
-    assert "training stopped at step 5: train/loss became nan; use a lower" in text
+    assert "training stopped at step 5: train/loss became nan; start a new run with a lower" in text
     assert not Path("broken/policy").exists()
     assert {path.name for path in Path("broken/checkpoints").iterdir()} == {"2", "4"}
     rows = Path("broken/metrics.jsonl").read_text()

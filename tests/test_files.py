@@ -78,7 +78,9 @@ def test_what_is_not_ours_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "folder.partial").mkdir()
     (tmp_path / "folder.partial" / "thesis.txt").write_text("mine")
     with (
-        pytest.raises(UsageError, match=r"thesis\.txt is in the way, which is no work of a command"),
+        pytest.raises(
+            UsageError, match=r"thesis\.txt is in the way, which is no work of a command"
+        ),
         new_folder(tmp_path / "folder"),
     ):
         pass

@@ -329,6 +329,18 @@ class TestCheckTask:
             assert bool(steps.terminated[-1]) == arrives
             assert float(steps.reward.sum()) == pytest.approx(0.0 if arrives else -0.9, abs=1e-6)
 
+    def test_shortest_paths_are_compiled_once_for_both_checks(self, monkeypatch):
+        traced = []
+        path = MazeRunner._shortest_path
+        monkeypatch.setattr(
+            MazeRunner, "_shortest_path", lambda *args: (traced.append(None), path(*args))[1]
+        )
+        env = MazeRunner(name="checked twice", side=7, horizon=10)
+        for _ in range(2):
+            env.check_task(self.good())
+            env.check_solvable(self.good())
+        assert len(traced) == 1
+
     def test_worlds_around_it_and_worlds_without_words_refuse_it_too(self):
         class Silent(MazeRunner):
             check_solvable = Environment.check_solvable

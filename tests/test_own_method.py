@@ -109,7 +109,10 @@ def test_its_settings_are_in_the_help(adapt: Run) -> None:
         ("--thrift much", "--thrift must be a number, found 'much'"),
         ("--c 2", "--c is no setting of lucky; it is one of ucb"),
         ("--keep-rewarded", "is no setting of lucky; it is one of ucb, bpe, explore"),
-        ("--method own_method:LuckyHyper", "own_method:LuckyHyper is a type, not a Method record"),
+        (
+            "--method own_method:LuckyHyper",
+            "own_method:LuckyHyper is a type; the place of a method must",
+        ),
         ("--method own_method:METHODS", "cannot load the method 'own_method:METHODS'"),
     ],
 )

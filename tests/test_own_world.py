@@ -242,7 +242,10 @@ def test_without_demonstrators_nothing_is_collected(command: Run, name: str) -> 
     [
         ("own_word:WORLD", "cannot load the world 'own_word:WORLD': No module named 'own_word'"),
         ("own_world:WORD", "has no attribute 'WORD'"),
-        ("own_world:Line", "own_world:Line is a type, not a World record"),
+        (
+            "own_world:Line",
+            "own_world:Line is a type; the place of a world must be that of a World",
+        ),
     ],
 )
 def test_wrong_places(command: Run, place: str, says: str) -> None:

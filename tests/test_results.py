@@ -17,17 +17,20 @@ from made_results import ENV, GOALS, SIDE, TINY, made_results, save_format_1
 
 import envs
 from envs.episodes import replay
-from envs.errors import DataError
+from envs.errors import DataError, UsageError
 from envs.gridworld.env import GridWorld
+from envs.maze.env import MazeRunner
 from envs.registry import WORLDS, World
 from experiments.store.metrics import read_metrics
 from experiments.store.policies import load_policy_of
 from experiments.store.results import PARTS, Results, load_results, results_of, save_results
 from experiments.store.summary import printed, read_summary, summarize
+from mgpo_jax.methods import BbtHyper
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.policy_files import read_policy, save_policy
 from mgpo_jax.prompts import single_goal
 from mgpo_jax.runner import adapt
+from mgpo_jax.settings import check_settings
 from mgpo_jax.tasks import sample_tasks, task_at
 from mgpo_jax.transformer import GoalTransformer, network_config
 
@@ -253,8 +256,8 @@ DAMAGES |= {
         r"best\.prompt\.goals holds 1e\+19 at seed 0, task 0, round 0, slot 2, number 0, must be",
     ),
     "no goals": (
-        rewrite("results.npz", choice__prompt__goals=np.full((*TWO, 3, 2), np.nan)),
-        r"choice\.prompt\.goals holds nan at seed 0, task 0, round 0, slot 2, number 0, must be",
+        rewrite("results.npz", best__prompt__goals=np.full((*TWO, 3, 2), np.nan)),
+        r"best\.prompt\.goals holds nan at seed 0, task 0, round 0, slot 2, number 0, must be",
     ),
     "prompts without a goal": (
         rewrite("results.npz", best__prompt__mask=np.zeros((*TWO, 3), bool)),
@@ -304,14 +307,15 @@ def test_broken_results_are_named(tmp_path: Path, name: str) -> None:
 
 
 def test_what_is_not_used_may_hold_anything(tmp_path: Path) -> None:
-    """A method of a user need not care for the slots that it masks, nor for numbers of its own."""
+    """A method need not care for slots that it does not use, prompts that only act, and its own numbers."""
     results = made_results()
     unused = ~results.best["prompt.mask"][..., None]
     goals = np.where(unused, np.float32(np.nan), results.best["prompt.goals"])
     goals[unused[..., 0], 1] = np.inf
     own = np.full((2, 2, 20, 4), -np.inf)
     parts = {**results.best, "prompt.goals": goals, "score": own}
-    made = replace(results, choices=parts, best=parts)
+    acted = {**parts, "prompt.goals": np.full_like(goals, np.nan)}
+    made = replace(results, choices=acted, best=parts)
     loaded = load_results(save(tmp_path / "run", made))
     assert_equal(loaded, made)
     assert np.isfinite(loaded.best_goals(0, 0)).all()
@@ -481,6 +485,32 @@ def test_episodes_in_a_world_of_chance_can_be_played_again(tmp_path: Path) -> No
 
 def summary_of(results: Results, sha256: str = "0" * 64) -> dict[str, Any]:
     return summarize(results, policy_sha256=sha256, num_episodes=88, num_failed=0, cpu_seconds=2.0)
+
+
+def test_the_widest_search_that_is_allowed_can_be_read(tmp_path: Path) -> None:
+    """Of the smallest population, whose steps vary most."""
+    with pytest.raises(UsageError, match=r"std.init must be at most 1000, found 1000000000.0"):
+        check_settings(BbtHyper(std_init=1e9))
+    policy_in(tmp_path / "policy", 0)
+    policy, made = read_policy(tmp_path / "policy"), made_results()
+    hyper = {"population_size": 2, "std_init": 1000.0}
+    outcome = adapt(ENV, policy, made.task_set, "bbt", hyper, seeds=2, episodes=40, eval_every=40)
+    settings = {"env": "tiny", "method": "bbt"}
+    results = results_of(outcome, settings, ENV, made.task_set, np.ones(2))
+    loaded = load_results(save(tmp_path / "run", results))
+    assert np.abs(loaded.choices["prompt.goals"]).max() > 1000
+    assert_equal(loaded, results)
+
+
+def test_a_summary_asks_the_world_once_which_tasks_can_be_solved(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    traced: list[None] = []
+    monkeypatch.setattr(
+        MazeRunner, "solvable", lambda self, task: (traced.append(None), jnp.ones((), bool))[1]
+    )
+    assert summary_of(made_results())["unsolvable_tasks"] == 0
+    assert len(traced) == 1
 
 
 def test_summaries_are_of_the_results() -> None:

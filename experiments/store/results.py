@@ -475,20 +475,24 @@ def _check_values(arrays: Mapping[str, np.ndarray], path: Path) -> None:
 
 
 def _check_prompts(parts: Mapping[str, np.ndarray], prefix: str, path: Path) -> None:
-    """Raise ``DataError`` for a prompt without a goal, or with one that no network can read.
+    """Raise ``DataError`` for a prompt without a goal, or for a best one with a goal that is no place.
 
-    Slots that are masked may hold anything.
+    Slots that are not used may hold anything. So may prompts that only acted, which nothing reads: with a
+    population of 2, CMA-ES ends at NaN after many episodes.
     """
     goals, mask = parts.get("prompt.goals"), parts.get("prompt.mask")
-    if mask is not None and not (some := mask.any(axis=-1)).all():
-        place = _place(~some, "SNR")
+    if mask is None:
+        return
+    empty = np.logical_not(mask.any(axis=-1))
+    if empty.any():
+        place = _place(empty, "SNR")
         raise DataError(f"{path}: {prefix}prompt.mask leaves no goal at {place}; {ADAPT_AGAIN}")
-    if goals is None or mask is None:
+    if goals is None or prefix == "choice.":
         return
     wrong = mask[..., None] & ~(np.abs(goals) <= LARGEST)  # which NaN is neither
     if wrong.any():
         raise DataError(
-            f"{path}: {prefix}prompt.goals holds {shown(float(goals[wrong][0]))} at "
+            f"{path}: {prefix}prompt.goals holds {goals[wrong][0]:g} at "
             f"{_place(wrong, 'SNRPG')}, must be from {-LARGEST:g} to {LARGEST:g}; {ADAPT_AGAIN}"
         )
 
