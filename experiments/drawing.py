@@ -132,8 +132,9 @@ def check_together(folders: Mapping[Path, Results], tasks: Sequence[int], seed: 
         if not 0 <= seed < len(result.returns):
             raise UsageError(f"--seed {seed}: {folder} has {len(result.returns)} seeds")
     num = first.returns.shape[1]
-    if not all(0 <= index < num for index in tasks):
-        raise UsageError(f"--tasks: {first.env} has the tasks 0 to {num - 1}")
+    for index in tasks:
+        if not 0 <= index < num:
+            raise UsageError(f"--tasks {index}: {first.env} has the tasks 0 to {num - 1}")
 
 
 def write(path: Path, save: Save) -> None:

@@ -31,6 +31,7 @@ from typing import Any, NoReturn
 from envs.errors import DataError, UsageError, printable, shown
 from experiments import signals
 from mgpo_jax.claims import NO_ROOM, check_place
+from mgpo_jax.settings import flag
 
 EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
 
@@ -197,7 +198,8 @@ def explained(error: BaseException, config: Any = None) -> str:
             what = cause.filename or "a file"
             return f"{what} cannot be read or written ({cause.strerror}); change its rights"
         if isinstance(cause, OSError) and cause.errno == errno.ENAMETOOLONG:
-            return f"the name {shown(cause.filename)} is too long; choose a shorter one"
+            where = _flag_of(config, cause.filename)
+            return f"{where}the name {shown(cause.filename)} is too long; choose a shorter one"
         if isinstance(cause, MemoryError) or "RESOURCE_EXHAUSTED" in str(cause):
             return "there is not enough memory; ask for less at once"
     text = str(error).splitlines()[0] if str(error) else "no reason is known"
@@ -205,6 +207,14 @@ def explained(error: BaseException, config: Any = None) -> str:
     if platforms and "nable to initialize backend" in text:
         return f"JAX_PLATFORMS={platforms} names no device of this machine; unset it, or use cpu"
     return f"something went wrong that was not foreseen: {text}; run with --debug to see where"
+
+
+def _flag_of(config: Any, path: Any) -> str:
+    """The flag that named a path, to begin a message; empty if none did."""
+    for name, value in (vars(config) if config is not None else {}).items():
+        if isinstance(value, Path) and str(path).startswith(str(value)):
+            return f"{flag(name)}: "
+    return ""
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:

@@ -125,8 +125,9 @@ class _Manifest(BaseModel):
 
     format: int
     sha256: Sha256
-    num_trajectories: Count | None = None
-    num_steps: Count | None = None
+    num_trajectories: Count = 0
+    num_steps: Count = 0
+    """0 where the manifest does not say."""
     env: Name | None = None
     policy: Name | None = None
     settings: dict[str, Json] = {}
@@ -165,7 +166,7 @@ def load_dataset(
     if manifest.format == 1:
         fields["goals"] = fields.pop("achieved_goals")
     counted = {"trajectory": manifest.num_trajectories, "step": manifest.num_steps}
-    sizes = {axis: size for axis, size in counted.items() if size is not None}
+    sizes = {axis: size for axis, size in counted.items() if size}
     arrays = read_arrays(path, fields, {**SIZES, **sizes}, mend)
     if manifest.format == 1:
         arrays["achieved_goals"] = arrays.pop("goals")

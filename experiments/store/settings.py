@@ -377,8 +377,8 @@ def check_reproduction(config: ReproduceConfig) -> None:
     """Raise ``UsageError`` for settings of ``experiments.reproduce`` that do not go together."""
     if config.what == "table4":  # which trains nothing
         for name in ("only", "steps", "trajectories"):
-            if getattr(config, name):
-                raise UsageError(f"table4 has no use for {flag(name)}; leave it out")
+            if value := getattr(config, name):
+                raise UsageError(f"table4 has no use for {flag(name)} {shown(value)}; leave it out")
     elif config.num_trajectories <= (kept := pretrain_preset(config.env, "fast").holdout):
         raise UsageError(
             f"--trajectories must be above {kept}, the trajectories kept out of training, found "

@@ -55,7 +55,8 @@ RESULT_CONFIG = JsonTraits(
 )
 RESULT_ARRAYS = NpzTraits(
     required=("returns", "eval_episodes", "eval_returns", "best.prompt.*", "choice.prompt.*"),
-    bounded=("eval_episodes", "reached_index", "reached_counts", "*.prompt.goals", "*returns"),
+    bounded=("eval_episodes", "reached_index", "reached_counts", "*returns"),
+    free=("*.prompt.goals",),
 )
 MAZES = NpzTraits(required=("*",), bounded=("maze", "goal"))
 NOTHING = JsonTraits(checked=(), document="either")

@@ -382,7 +382,7 @@ def _odd_line(rng: np.random.Generator, command: str) -> Case:
     codes = BOTH if Path in flag.kinds and "=x=y" in chosen[-1] else USAGE
     if Path in flag.kinds and flag.name in OUTPUTS and "=x=y" in chosen[-1]:
         expected = "either"
-    return _case(command, chosen, expected, (name, flag.name), (), codes, ("x=y",))
+    return _case(command, chosen, expected, (name, flag.name, "unknown"), (), codes, ("x=y",))
 
 
 def _contradiction(rng: np.random.Generator, command: str) -> Case:

@@ -46,6 +46,8 @@ class NpzTraits:
     """Arrays that may not be missing."""
     bounded: Sequence[str] = ()
     """Arrays whose numbers have a range that excludes -1 and the largest number of the type."""
+    free: Sequence[str] = ()
+    """Arrays some of whose numbers nobody reads, so that these may be anything."""
     hash_in: tuple[str, str] | None = None
     """The JSON file beside it, and the entry there that holds the hash of this one."""
 
@@ -151,6 +153,7 @@ def _number(rng: np.random.Generator, arrays: Arrays, traits: NpzTraits) -> Dama
         value = pick(rng, (np.nan, np.inf, -np.inf, 1e38, -3e38))
         expected = _checked(name, traits) if bounded or abs(value) != 1e38 else "either"
         expected = expected if bounded or not np.isfinite(value) else "either"
+        expected = "either" if _fits(name, traits.free) else expected
     else:
         limits = np.iinfo(array.dtype)
         value = pick(rng, (limits.min, limits.max, max(limits.min, -1)))
