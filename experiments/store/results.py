@@ -90,6 +90,7 @@ FIELDS = {
 PART_FIELDS = {
     "prompt.goals": _field("SNRPG", "float32", any_value=True),  # see ``_check_prompts``
     "prompt.mask": _field("SNRP", "bool"),
+    "greedy": _field("SNR", "bool"),
 }
 """Of the parts of choices that are known; any other is ``OTHER_PART``."""
 OTHER_PART = _field("SNR*", "anything", any_value=True)

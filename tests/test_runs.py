@@ -1,0 +1,55 @@
+"""What a resumed run is compared by."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from experiments.store.runs import changes, identity, say_what_differs
+from experiments.store.settings import PretrainConfig
+
+BEFORE = {
+    "devices": ["TFRT_CPU_0", "TFRT_CPU_1"],
+    "versions": {"jax": "0.10.2", "numpy": "2.0", "flax": "0.12.8"},
+}
+
+
+def test_the_same_machine_and_versions_need_no_word(capsys: pytest.CaptureFixture[str]) -> None:
+    say_what_differs(BEFORE, BEFORE, "run")
+    assert capsys.readouterr().err == ""
+
+
+def test_other_devices_and_versions_are_said_in_one_line(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    now = {"devices": ["cuda:0"], "versions": {"jax": "0.11.2", "numpy": "2.0"}}
+    say_what_differs(BEFORE, now, "run")
+    assert capsys.readouterr().err == (
+        "run was begun with 2 x TFRT_CPU (now 1 x cuda), jax '0.10.2' (now 0.11.2), "
+        "flax '0.12.8' (now None): the result may differ in its last bits\n"
+    )
+
+
+def test_fewer_cores_are_said(capsys: pytest.CaptureFixture[str]) -> None:
+    say_what_differs(BEFORE, {**BEFORE, "devices": ["TFRT_CPU_0"]}, "run")
+    assert "2 x TFRT_CPU (now 1 x TFRT_CPU)" in capsys.readouterr().err
+
+
+def test_a_run_is_known_by_what_decides_about_its_weights() -> None:
+    config = PretrainConfig()
+    same = replace(config, out=Path("elsewhere"), eval_every=7, resume=True, tb=True)
+    assert identity(same, "ab") == identity(config, "ab")
+    others = [
+        replace(config, train=replace(config.train, seed=1)),
+        replace(config, data=replace(config.data, data_seed=1)),
+        replace(config, embed_dim=64),
+    ]
+    identities = {identity(config, "cd"), *(identity(other, "ab") for other in others)}
+    assert len(identities - {identity(config, "ab")}) == 4
+
+
+def test_what_changed_is_told_by_name() -> None:
+    assert changes({"a": 1, "b": 2}, {"a": 1, "b": 2}) == ""
+    assert changes({"a": 1, "b": "x"}, {"a": 2, "c": 3}) == "a 1 -> 2; b 'x' -> None; c None -> 3"
