@@ -42,6 +42,7 @@ def run(tmp_path: Path) -> Path:
     (tmp_path / "run" / "metrics.jsonl").write_text(rows)
     meta = {"command": ["python", "-m", "experiments.pretrain"], "revision": "x"}
     (tmp_path / "run" / "meta.json").write_text(json.dumps(meta))
+    (tmp_path / "run" / "training.png").touch()
     return tmp_path / "run"
 
 
