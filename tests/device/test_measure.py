@@ -14,6 +14,7 @@ def test_rates() -> None:
     assert all(value > 0 for value in figures.values()), figures
 
 
+@pytest.mark.slow
 def test_adapt_shows_wall_time_and_compiles_once() -> None:
     first, second = adapt("maze15", 1, seeds=1, episodes=1, eval_every=1, segments=1)
     assert first["compile, s"] > 100 * second["compile, s"]

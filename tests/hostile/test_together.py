@@ -67,6 +67,7 @@ def test_a_training_is_told_who_trains_there(
     reference.check(here, PRETRAIN)
 
 
+@pytest.mark.slow
 def test_one_collects_what_two_want(server: Server, reference: Reference, here: Path) -> None:
     """The other one waits for the dataset, and both train."""
     data = here / "data"
