@@ -424,7 +424,9 @@ class TestRegistry:
         )
         assert envs.find("world_file_here:WORLD").name == "own"
         assert envs.make("world_file_here:WORLD") == envs.make("maze15")
-        with pytest.raises(UsageError, match="world_file_here:NO is a int; the place of a world must be"):
+        with pytest.raises(
+            UsageError, match="world_file_here:NO is a int; the place of a world must be"
+        ):
             envs.find("world_file_here:NO")
         with pytest.raises(UsageError, match="cannot load the world 'world_file_here:OTHER'"):
             envs.find("world_file_here:OTHER")

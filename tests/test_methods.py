@@ -129,7 +129,10 @@ def test_a_method_in_a_module_of_ones_own(module, policy):
     ("place", "says"),
     [
         ("{}:OTHER", "cannot load the method '{}:OTHER': .*has no attribute 'OTHER'"),
-        ("{}:NOT_MINE", "{}:NOT_MINE is a dict; the place of a method must be that of a Method record"),
+        (
+            "{}:NOT_MINE",
+            "{}:NOT_MINE is a dict; the place of a method must be that of a Method record",
+        ),
         ("no_such_module:MINE", "cannot load the method .*No module named 'no_such_module'"),
     ],
 )
