@@ -249,10 +249,10 @@ def refuse_existing(folder: Path, *ways_out: str) -> None:
     check_place(folder)
 
 
-def refuse_existing_file(path: Path, flag: str) -> None:
+def refuse_existing_file(path: Path, named_by: str) -> None:
     """Raise ``UsageError`` if a file to be written exists, or if it could not be made."""
     if os.path.lexists(path):
-        raise UsageError(f"{flag} {path} exists already; remove it or choose another file")
+        raise UsageError(f"{named_by} {path} exists already; remove it or choose another file")
     if not path.name or not path.absolute().parent.is_dir():
-        raise UsageError(f"{flag} {path}: there is no folder {path.parent}; make it first")
-    check_place(path, flag)
+        raise UsageError(f"{named_by} {path}: there is no folder {path.parent}; make it first")
+    check_place(path, named_by)

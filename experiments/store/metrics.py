@@ -18,8 +18,6 @@ from mgpo_jax.files import to_json, write_text
 from mgpo_jax.schema import read_json_lines
 
 METRICS = "metrics.jsonl"
-
-
 RESUME = "resume the run with `python -m experiments.pretrain --resume` and its other flags"
 
 
