@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
 from envs.base import Episode, Trajectory
-from envs.drawing import Pictures, spread_apart
+from envs.drawing import Film, Pictures, spread_apart, video, write_films
 from envs.maze import pictures as maze
 from envs.maze.env import NORTH, MazeRunner, MazeTask
 from experiments import figures
@@ -338,6 +338,31 @@ def test_short_prompts_stand_above_long_ones(key):
         assert all(abs(disc[2] - 3) < 1.5 for disc in discs_of(below))
 
 
+A, B, C, END = np.eye(4, dtype=np.float32)
+
+
+@pytest.mark.parametrize(
+    ("goals", "other"),
+    [
+        ((A, B, END), (B, A, END)),
+        ((A, B, C, END), (C, B, A, END)),
+        ((A, A, B, END), (B, A, A, END)),
+        ((A, B, A, END), (B, A, A, END)),  # the reverse is the same
+        ((A, B, B, A, END), (B, B, A, A, END)),
+        ((A, END, END), (END, A, END)),
+        ((A, A, END), None),
+        ((A, END), None),
+        ((END,), None),
+    ],
+)
+def test_the_same_goals_in_another_order(goals, other):
+    found = rollouts.in_another_order(np.stack(goals))
+    if other is None:
+        assert found is None
+    else:
+        np.testing.assert_array_equal(found, np.stack(other))
+
+
 def write_all(folder, drawn):
     """Write figures into a folder; returns their names."""
     names = []
@@ -383,6 +408,47 @@ def test_methods_without_prompts_stand_aside(tmp_path):
     only_prompts = Pictures(prompts=PICTURES.prompts)
     drawn = figures.figures_of_results(only_prompts, results, refuse, (0,), 0)
     assert write_all(tmp_path, drawn) == ["prompts.png"]
+
+
+@pytest.mark.parametrize("another_order", [False, True])
+def test_a_video_shows_another_order_where_the_world_asks_for_it(another_order, tmp_path):
+    goal = np.array([GOAL], np.float32) / SIDE
+    goals = np.concatenate([np.array([[3, 3], [1, 1]], np.float32) / SIDE, goal])
+    result = replace(fake_results(), found=[{1: goals}] * 2)
+    played = []
+
+    def play(key, task, goals, num, greedy):
+        played.append(goals)
+        return PLAY(key, task, goals, num, greedy)
+
+    drawn = []
+    offered = Pictures(
+        video=lambda path, task, shown: drawn.extend(shown), another_order=another_order
+    )
+    ((name, save),) = figures.figures_of_results(offered, {"ucb": result}, lambda _: play, (0,), 0)
+    save(tmp_path / name)
+    titles = ["Initial prompt", "Optimized prompt", "The same goals in another order"]
+    prompts = [goal, goals, goals[[1, 0, 2]]]
+    num = 2 + another_order
+    assert [each.title for each in drawn] == [
+        f"{title}, return \N{MINUS SIGN}0.60" for title in titles[:num]
+    ]
+    for each, asked, wanted in zip(drawn, played, prompts[:num], strict=True):
+        np.testing.assert_array_equal(each.goals, wanted)
+        np.testing.assert_array_equal(asked, wanted)
+
+
+def test_titles_of_films_fit_above_them(tmp_path, monkeypatch):
+    kept = []
+    monkeypatch.setattr(video, "write_gif", lambda path, figure, *more: kept.append(figure))
+    title = "The same goals in another order, return \N{MINUS SIGN}23.81"
+    for width in (100, 200, 288):
+        pixels = np.zeros((1, 200, width, 3), np.uint8)
+        film = Film(title, 1, lambda times, pixels=pixels: pixels, lambda time: "step 1")
+        write_films(tmp_path / "films.gif", [film] * 3)
+        boxes = [ax.title.get_window_extent() for ax in kept[-1].axes]
+        assert all(one.x1 < other.x0 for one, other in pairwise(boxes))
+        assert all(box.y1 < kept[-1].bbox.y1 for box in boxes)
 
 
 def test_a_world_that_draws_only_frames_gets_videos(tmp_path):

@@ -268,6 +268,7 @@ def test_everything_that_gridworld_draws(tmp_path):
         save(tmp_path / name)
         drawn[name] = iio.imread(tmp_path / name)
     assert set(drawn) == {"ucb_search.png", "ucb_episodes.png", "ucb_episode_task1.gif"}
+    assert drawn["ucb_episode_task1.gif"].shape[-2] > 900  # three panels: another order, too
     for picture in drawn.values():
         assert min(picture.shape[-3:-1]) > 100
         assert np.ptp(picture) > 0

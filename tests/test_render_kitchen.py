@@ -18,6 +18,8 @@ from envs.kitchen.pictures import kitchen_frames
 require_kitchen()
 import mujoco  # noqa: E402
 
+from envs.kitchen.model import full_model  # noqa: E402
+
 DRAW = """
 import sys, numpy as np
 from envs.kitchen.pictures import Panel, kitchen_gif
@@ -60,6 +62,24 @@ def test_frames_show_what_moved(tmp_path):
     assert not right.any()  # the episode that has ended stands still
     half = left.shape[1] // 2
     assert left[:, :half].mean() > 10 * left[:, half:].mean()  # the microwave is to the left
+
+
+def test_what_only_is_to_be_seen_is_drawn(monkeypatch):
+    """The model that is stepped may lack it."""
+    drawn = []
+
+    def refuse(model, *args):
+        drawn.append(model)
+        raise RuntimeError("enough")
+
+    monkeypatch.setattr(mujoco, "Renderer", refuse)
+    with pytest.raises(NoOpenGLError):
+        kitchen_frames(np.zeros((1, 59)))
+    (model,) = drawn
+    assert model is full_model()
+    collides = (model.geom_contype > 0) | (model.geom_conaffinity > 0)
+    assert collides.any()
+    assert not collides.all()
 
 
 def test_no_opengl(monkeypatch):

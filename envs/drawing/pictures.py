@@ -59,6 +59,9 @@ class Pictures(NamedTuple):
     frame: Callable | None = None
     """``(obs) -> [H, W, 3]`` bytes: what the world looks like at an observation. Generic code makes the
     video of a world that offers only this."""
+    another_order: bool = False
+    """Whether a video also shows the goals of the optimized prompt in another order, as in worlds whose
+    tasks are orders."""
     panel: tuple[float, float] = (2.0, 2.2)
     """Inches that the picture of one task takes, with its title and its share of a legend."""
     row: Callable[[int], tuple[float, float]] = lambda num_goals: (0.2 * num_goals + 0.6, 0.24)

@@ -21,7 +21,8 @@ PALETTE_FRAMES = 10  # whose colors make the palette
 
 MAX_FILM_FRAMES = 75
 HEAD, LINE, BELOW = 22, 13, 18  # pixels of a headline, of a line of a title, and of a caption
-LETTERS = 52  # that a line of a title holds
+LETTER = 5.5  # pixels of a letter of a title, on average
+MIN_LETTERS = 12  # that a line of a title holds, however narrow its picture
 GAP = 0.01  # between films, as a share of the width
 SPACE = 0.12  # inches between axes in a row
 
@@ -79,7 +80,8 @@ def write_films(path: Path, films: Sequence[Film], headline: str = "") -> None:
     times_of = [np.minimum(times, film.num_times - 1) for film in films]
     frames_of = [film.frames(when) for film, when in zip(films, times_of, strict=True)]
     height, width = frames_of[0].shape[1:3]
-    titles = ["\n".join(fill(line, LETTERS) for line in film.title.splitlines()) for film in films]
+    letters = max(MIN_LETTERS, int(width / LETTER))
+    titles = ["\n".join(fill(line, letters) for line in film.title.splitlines()) for film in films]
     whole = (HEAD if headline else 0) + _room_for(titles) + height + BELOW
     figure = Figure(figsize=(len(films) * width / DPI, whole / DPI), dpi=DPI, facecolor=PAPER)
     figure.text(0.5, 1 - 5 / whole, headline, color=INK, fontsize=8.5, ha="center", va="top")

@@ -66,7 +66,12 @@ def grid_pictures(env: GridWorld) -> Pictures:
         return UNIT * (max(NUM_OBJECTS, num_goals - 1) + RETURN_ROOM), UNIT * ROW
 
     return Pictures(
-        search=draw_searches, episodes=draw_episodes, video=write_video, panel=(2.0, 2.75), row=row
+        search=draw_searches,
+        episodes=draw_episodes,
+        video=write_video,
+        another_order=True,
+        panel=(2.0, 2.75),
+        row=row,
     )
 
 

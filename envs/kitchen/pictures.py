@@ -19,12 +19,14 @@ from envs.kitchen.extra import NoOpenGLError, import_mujoco
 CAMERA = {"distance": 2.2, "azimuth": 70.0, "elevation": -35.0, "lookat": (-0.2, 0.5, 2.0)}
 NAMES = ("burner", "light", "slide", "hinge", "microwave")  # of the subtasks
 REST = 25  # steps that are shown after the last completed subtask
+IN_ORDER = "\N{CHECK MARK}"  # behind subtasks whose completion was rewarded
+NO_BREAK = "\N{NO-BREAK SPACE}"  # keeps a goal of several subtasks on one line
 
 
 def kitchen_pictures(env: Kitchen) -> Pictures:
     """A GIF of one task; all engines of the kitchen look the same."""
     del env
-    return Pictures(video=write_video)
+    return Pictures(video=write_video, another_order=True)
 
 
 def write_video(path: Path, task: Task, shown: Sequence[Shown]) -> None:
@@ -34,7 +36,7 @@ def write_video(path: Path, task: Task, shown: Sequence[Shown]) -> None:
       UsageError: where there is no OpenGL to draw with.
     """
     order = [NAMES[subtask] for subtask in task.order if subtask != NONE]
-    title = f"Task, in an order that is not told: {', '.join(order)}"
+    title = f"Task, in an order that is not told: {', '.join(order)}  ({IN_ORDER} in order)"
     try:
         kitchen_gif(path, title, [panel_of(each) for each in shown])
     except NoOpenGLError as error:
@@ -51,9 +53,9 @@ def kitchen_frames(
       MissingExtraError: if the packages of the kitchen are missing.
     """
     mujoco = import_mujoco()
-    from envs.kitchen.model import load_model
+    from envs.kitchen.model import full_model
 
-    model = load_model("stock")
+    model = full_model()
     data = mujoco.MjData(model)
     camera = mujoco.MjvCamera()
     for name, value in CAMERA.items():
@@ -106,9 +108,11 @@ def kitchen_gif(
 
 def panel_of(shown: Shown) -> Panel:
     """An episode as what it looked like, until soon after the last subtask was completed."""
-    trajectory = shown.episode.trajectory
-    times = np.flatnonzero(trajectory.goal_reached[: trajectory.length])
-    completed = [(int(time) + 1, NAMES[trajectory.achieved_goals[time].argmax()]) for time in times]
+    trajectory, rewards = shown.episode.trajectory, shown.episode.rewards
+    completed = []
+    for time in np.flatnonzero(trajectory.goal_reached[: trajectory.length]):
+        name = NAMES[trajectory.achieved_goals[time].argmax()]
+        completed.append((int(time) + 1, f"{name}{IN_ORDER}" if rewards[time] > 0 else name))
     obs = observations(shown.episode)
     if completed:
         obs = obs[: completed[-1][0] + REST]
@@ -124,4 +128,4 @@ def _word(goal: np.ndarray) -> str:
     if not np.isin(goal, (0.0, 1.0)).all():
         return f"({', '.join(f'{value:.1f}' for value in goal)})"
     named = [NAMES[index] for index in np.flatnonzero(goal)]
-    return named[0] if len(named) == 1 else "{" + ", ".join(named) + "}"
+    return named[0] if len(named) == 1 else "{" + f",{NO_BREAK}".join(named) + "}"

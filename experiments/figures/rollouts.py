@@ -1,8 +1,8 @@
 """Figures of prompts and of episodes under them, for every world that draws.
 
-The numbers are those of the paper's figures: 2 prompts, 3 and 10 how prompt and behavior evolve, 9 short
-and long prompts. A world draws what it offers in its ``Pictures``; figures that it does not offer are
-left out, and so are those of methods without prompts.
+The numbers are those of the paper's figures: 2 prompts, 3 and 10 how prompt and behavior evolve, 5 that
+the order of a prompt decides, 9 short and long prompts. A world draws what it offers in its ``Pictures``;
+figures that it does not offer are left out, and so are those of methods without prompts.
 """
 
 from __future__ import annotations
@@ -237,12 +237,15 @@ def video(
     key: jax.Array,
     path: Path,
 ) -> None:
-    """A GIF of a greedy episode under the initial prompt, beside one under the optimized prompt."""
-    task = result.task(index)
-    named = {
-        "Initial prompt": result.task_goals[index][None],
-        "Optimized prompt": _best_goals(result, seed, index),
-    }
+    """Figure 5: a GIF of greedy episodes under the initial and the optimized prompt, side by side.
+
+    Where the world asks for it and there is one, another order of the optimized goals stands beside them.
+    """
+    task, optimized = result.task(index), _best_goals(result, seed, index)
+    named = {"Initial prompt": result.task_goals[index][None], "Optimized prompt": optimized}
+    reordered = in_another_order(optimized) if pictures.another_order else None
+    if reordered is not None:
+        named["The same goals in another order"] = reordered
     shown = []
     for name, goals in named.items():
         played = _play_once(play, jax.random.fold_in(key, index), task, goals)
@@ -252,6 +255,19 @@ def video(
         pictures.video(path, task, shown)
     elif pictures.frame:
         write_films(path, [_film(pictures.frame, each) for each in shown])
+
+
+def in_another_order(goals: np.ndarray) -> np.ndarray | None:
+    """A prompt ``[k, G]`` with the goals before its final one reversed.
+
+    Where that changes nothing, as in A B A, the first of them goes behind the others. None where all of
+    them are equal, or fewer than two: there is no other order then.
+    """
+    before, final = goals[:-1], goals[-1:]
+    for other in (before[::-1], np.roll(before, -1, axis=0)):
+        if not np.array_equal(other, before):
+            return np.concatenate([other, final])
+    return None
 
 
 def longest_prompt(
