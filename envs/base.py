@@ -230,6 +230,15 @@ class Environment:
         del task
         return jnp.ones((), bool)
 
+    def num_parts(self, task: Task) -> Int[Array, ""]:
+        """The number n of parts of this task that pay 1/n each when they are done in order.
+
+        The default is 0: the task is not rewarded part by part. Elsewhere the return of an episode times n
+        is the number of parts that were done.
+        """
+        del task
+        return jnp.zeros((), jnp.int32)
+
     def sample_goal(self, key: PRNGKeyArray) -> Float[Array, "G"]:
         """A random goal that can stand in a prompt, drawn without knowledge of the task.
 
@@ -337,3 +346,10 @@ class Demonstrator(NamedTuple):
     """Arrays that the agent is made from, such as the weights of a network; they enter programs as data."""
     settings: tuple[tuple[str, float], ...] = ()
     """Names and values of what else its data depends on; a dataset made with others is out of date."""
+    env: Environment | None = None
+    """The world that it demonstrates in, where that is another one than the world it is asked for. Both
+    have the same observations, goals and actions, and equal tasks have equal fingerprints."""
+    variants: tuple[str, ...] = ()
+    """Names of the variants of that world, such as its scenes, of which each task is of one."""
+    variant: Callable = lambda task: jnp.zeros((), jnp.int32)
+    """``(task) -> index`` into ``variants``; a dataset keeps it for every trajectory."""

@@ -17,6 +17,7 @@ import envs
 from envs.base import ArraySpec, Box, Discrete, Engine, Environment, EnvSpec
 from envs.errors import NotAvailableError, UsageError
 from envs.registry import WORLDS
+from envs.wrappers import Noisy
 
 
 def installed(name):
@@ -214,6 +215,19 @@ def test_returns_stay_in_the_range_of_the_spec(world):
 def test_no_play_beats_the_optimal_return(world):
     best = np.sort(world["best"])[::-1][:NUM_LANES]
     assert (world["steps"].reward.sum(1) <= best + 1e-4).all()
+
+
+def test_every_reward_is_that_of_one_part(world):
+    """Where a world says that its tasks are rewarded part by part."""
+    env, rewards = world["env"], world["steps"].reward
+    parts = np.asarray(jax.vmap(env.num_parts)(world["tasks"]))
+    assert np.issubdtype(parts.dtype, np.integer)
+    assert parts.shape == (NUM_TASKS,)
+    assert (parts >= 0).all()
+    assert (parts == 0).all() or env.spec.reward_confirms_goals
+    of_easy = np.asarray(jax.vmap(Noisy(env).num_parts)(world["easy"]))[:, None]
+    paid = (rewards * of_easy)[of_easy[:, 0] > 0]
+    np.testing.assert_allclose(paid, paid > 0, atol=1e-5)
 
 
 def test_the_outcome_of_a_solved_task_is_its_goal(world):

@@ -390,6 +390,15 @@ class TestOracle:
         for index, rows in enumerate(expected):
             assert_same_episode(jax.tree.map(lambda leaf, index=index: leaf[index], steps), rows)
 
+    def test_returns_are_the_parts_that_were_done(self, walks):
+        orders, steps, expected = walks
+        rows = jnp.asarray(np.stack([padded(order) for order in orders]))
+        parts = np.asarray(jax.vmap(WORLD.num_parts)(GridTask(rows)))
+        np.testing.assert_array_equal(parts, [len(order) for order in orders])
+        paid = [sum(step.reward > 0 for step in walk) for walk in expected]
+        np.testing.assert_allclose(steps.reward.sum(axis=1) * parts, paid, atol=1e-4)
+        assert len(set(paid)) == 8
+
     def test_everything_occurs_in_them(self, walks):
         """The comparison above sees each rule at work, and not only once."""
         orders, steps, _ = walks

@@ -20,7 +20,7 @@ from envs.episodes import replay
 from envs.errors import DataError, UsageError
 from envs.gridworld.env import GridWorld
 from envs.maze.env import MazeRunner
-from envs.registry import WORLDS, World
+from envs.registry import WORLDS, Judgement, World
 from experiments.store.metrics import read_metrics
 from experiments.store.policies import load_policy_of
 from experiments.store.results import PARTS, Results, load_results, results_of, save_results
@@ -76,6 +76,7 @@ def test_results_survive_the_disk(tmp_path: Path) -> None:
     assert loaded.summary == read_summary(folder)
     assert loaded.summary["regret"] == pytest.approx(0.85)
     assert (loaded.env, loaded.method, loaded.optimum_known) == ("tiny", "ucb", True)
+    assert "num_parts" in vars(loaded)  # the world was not asked again
     np.testing.assert_allclose(loaded.task_goals, GOALS / SIDE, rtol=1e-6)
     meta = json.loads((folder / "meta.json").read_text())
     assert meta["format"] == 2
@@ -134,6 +135,7 @@ def test_results_of_the_first_version_are_read(tmp_path: Path) -> None:
     config = {"env": "tiny", "bandit": "ucb", "policy": None}
     assert_equal(loaded, replace(results, best=best, config=config))
     assert loaded.method == "ucb"
+    assert loaded.num_parts.tolist() == [0, 0]
     np.testing.assert_allclose(loaded.task_goals, GOALS / SIDE, rtol=1e-6)
 
 
@@ -262,6 +264,14 @@ DAMAGES |= {
     "prompts without a goal": (
         rewrite("results.npz", best__prompt__mask=np.zeros((*TWO, 3), bool)),
         r"best\.prompt\.mask leaves no goal at seed 0, task 0, round 0",
+    ),
+    "parts below zero": (
+        rewrite("results.npz", num_parts=np.array([3, -1])),
+        "num_parts holds -1 at task 1, must be from 0 to",
+    ),
+    "parts of other tasks": (
+        rewrite("results.npz", num_parts=np.array([3, 3, 3])),
+        r"num_parts has shape \[3\], wanted \[task 2\]",
     ),
     "mazes of words": (
         rewrite("tasks.npz", maze=np.full((2, 7, 7), "wall")),
@@ -536,6 +546,60 @@ def test_regret_after_40_is_unknown_where_nothing_was_judged_then() -> None:
     assert "  after 40       -" in printed(summary)
 
 
+def in_parts(**changes: Any) -> Results:
+    """2 seeds of tasks of 3 and 7 objects."""
+    order = np.array([[2, 0, 5, -1, -1, -1, -1], [6, 5, 4, 3, 2, 1, 0]], np.int32)
+    flags = {"choice": np.zeros((2, 2, 20), np.int32)}
+    final = np.array([[1, 6 / 7], [1 / 3, 1]], np.float32)
+    made = {
+        "tasks": {"order": order},
+        "config": {"env": "short", "method": "gcbc"},
+        "eval_returns": np.stack([np.zeros((2, 2), np.float32), final], axis=-1),
+        "choices": flags,
+        "best": flags,
+        "reached": None,
+    }
+    return made_results(**{**made, **changes})
+
+
+def test_parts_that_were_done_are_counted_and_printed(tmp_path: Path) -> None:
+    folder = save(tmp_path / "run", in_parts())
+    with np.load(folder / "results.npz") as file:
+        assert file["num_parts"].tolist() == [3, 7]
+    loaded = load_results(folder)
+    assert loaded.num_parts.tolist() == [3, 7]
+    shares = [(1.0, 4), (0.75, 4), (0.75, 4), (1.0, 2), (1.0, 2), (1.0, 2), (0.5, 2)]
+    assert loaded.summary["part_shares"] == shares
+    lines = printed(loaded.summary).splitlines()
+    first = lines.index("parts in order   share with the first k done (tasks x seeds that have k)")
+    assert lines[first + 1] == "  p1             1.00 (4)"
+    assert lines[first + 7] == "  p7             0.50 (2)"
+    assert lines[first + 8].startswith("speed")
+
+
+def test_parts_are_not_counted_where_only_a_mean_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ten episodes of 3 parts each with a mean of 1/3: nobody knows how many did one part."""
+    several = {"env": "short", "method": "gcbc", "eval_episodes": 10}
+    folder = save(tmp_path / "run", in_parts(config=several))
+    loaded = load_results(folder)
+    assert loaded.num_parts.tolist() == [3, 7]
+    assert loaded.summary["part_shares"] is None
+    assert "parts" not in printed(loaded.summary)
+    often = replace(GRID, judged=Judgement(episodes=10))
+    monkeypatch.setitem(WORLDS._registered, "short", often)
+    assert summary_of(in_parts())["part_shares"] is None
+    assert summary_of(in_parts(config={**several, "eval_episodes": 1}))["part_shares"] is not None
+
+
+def test_a_world_that_is_not_rewarded_in_parts_has_none(tmp_path: Path) -> None:
+    folder = save(tmp_path / "run", made_results())
+    assert load_results(folder).num_parts.tolist() == [0, 0]
+    assert read_summary(folder)["part_shares"] is None
+    assert "parts" not in printed(read_summary(folder))
+
+
 def test_episodes_of_broken_worlds_are_printed() -> None:
     assert "failed episodes  3 (the world broke down)" in printed(
         {**summary_of(made_results()), "failed_episodes": 3}
@@ -547,5 +611,6 @@ def test_nothing_is_compared_with_an_unknown_optimum() -> None:
     unknown = {name for name, value in summary.items() if value is None}
     assert unknown == {
         "optimal_return", "regret", "regret_std_over_seeds", "regret_after_40", "solved_optimally",
+        "part_shares",
     }  # fmt: skip
     assert not any(word in printed(summary) for word in ("optim", "regret", "nan"))

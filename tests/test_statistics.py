@@ -11,10 +11,12 @@ from scipy.stats import bootstrap, mannwhitneyu, trim_mean
 
 from envs.errors import UsageError
 from experiments.store.statistics import (
+    MOST_PARTS,
     Interval,
     compare,
     interquartile_mean,
     paired_difference,
+    part_shares,
     same_tasks,
     seed_spread,
     stratified_bootstrap_iqm,
@@ -119,6 +121,61 @@ def test_intervals_are_those_of_scipy_with_each_task_of_each_method_as_a_stratum
         width = wanted.high - wanted.low
         assert interval.low == pytest.approx(wanted.low, abs=0.04 * width)
         assert interval.high == pytest.approx(wanted.high, abs=0.04 * width)
+
+
+def test_shares_of_parts_by_hand() -> None:
+    """Two seeds of tasks of 1, 3 and 2 parts, and one that is not rewarded part by part."""
+    returns = np.array([[1, 2 / 3, 0.5, -5], [0, 1, 0, 0.3]], np.float32)
+    found = part_shares(returns, np.array([1, 3, 2, 0]))
+    assert found == [(4 / 6, 6), (2 / 4, 4), (1 / 2, 2)]
+    assert [str(share) for share in found] == ["0.67 (6)", "0.50 (4)", "0.50 (2)"]
+
+
+def test_shares_of_parts_count_every_part_that_was_done() -> None:
+    """As loops over searches count them, from returns that are sums of float32 rewards."""
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        num_parts = rng.integers(0, 8, size=9)
+        num_parts[0] = 7
+        done = rng.integers(0, num_parts + 1, size=(3, 9))
+        rewards = np.float32(1) / np.maximum(num_parts, 1).astype(np.float32)
+        returns = np.array(
+            [
+                [np.sum([r] * n, dtype=np.float32) for r, n in zip(rewards, row, strict=True)]
+                for row in done
+            ]
+        )
+        found = part_shares(returns, num_parts)
+        assert found is not None
+        for k, (share, num) in enumerate(found, 1):
+            having = [
+                n for row in done for n, most in zip(row, num_parts, strict=True) if most >= k
+            ]
+            assert num == len(having)
+            assert share == pytest.approx(sum(n >= k for n in having) / num)
+        assert sum(share * num for share, num in found) == pytest.approx(done.sum())
+        assert len(found) == 7
+
+
+@pytest.mark.parametrize(
+    ("returns", "num_parts"),
+    [
+        ([[1.0, -0.3]], [0, 0]),  # no world of parts
+        ([[1.0, 0.35]], [2, 2]),  # a mean of several episodes, or another reward
+        ([[1.0, -0.5]], [2, 2]),
+        ([[1.5, 0.5]], [2, 2]),
+        ([[1.0, np.nan]], [2, 2]),
+    ],
+)
+def test_returns_that_are_no_parts_have_no_shares(
+    returns: list[list[float]], num_parts: list[int]
+) -> None:
+    assert part_shares(np.array(returns), np.array(num_parts)) is None
+
+
+def test_of_many_parts_the_first_are_told() -> None:
+    found = part_shares(np.array([[0.5]]), np.array([1000]))
+    assert found == [(1.0, 1)] * MOST_PARTS
 
 
 @pytest.mark.parametrize(("num_seeds", "least", "most"), [(3, 0.82, 0.96), (10, 0.91, 0.98)])

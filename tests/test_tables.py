@@ -14,7 +14,9 @@ import pytest
 from made_results import TINY, made_results
 from test_architecture import call_without_jax
 
+import envs.kitchen
 from envs.errors import DataError, UsageError
+from envs.kitchen import MissingExtraError
 from envs.registry import WORLDS
 from experiments.store.results import Results, save_results
 from experiments.store.rows import HEAD, Row, comparison, read_row
@@ -27,6 +29,7 @@ ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "results"
 PUBLISHED = sorted(path.parent for path in RESULTS.rglob("summary.json"))
 ONE_PUBLISHED = RESULTS / "maze15" / "ucb"
+KITCHEN = RESULTS / "kitchen" / "ucb"
 
 
 @pytest.fixture
@@ -53,6 +56,33 @@ def copied(tmp_path: Path) -> Path:
     """A copy of published results, to be changed."""
     shutil.copytree(ONE_PUBLISHED, tmp_path / "ucb")
     return tmp_path / "ucb"
+
+
+@pytest.fixture
+def with_parts(tmp_path: Path) -> Path:
+    """Published results of Kitchen as this version writes them, with the numbers of parts."""
+    folder = tmp_path / "kitchen"
+    shutil.copytree(KITCHEN, folder)
+    write_parts(folder, num_parts=(np.load(KITCHEN / "tasks.npz")["order"] >= 0).sum(axis=1))
+    change(folder / "summary.json", part_shares=counted(KITCHEN))
+    return folder
+
+
+def write_parts(folder: Path, **arrays: np.ndarray) -> None:
+    with np.load(folder / "results.npz") as file:
+        kept = {name: array for name, array in file.items() if name != "num_parts"}
+    np.savez(folder / "results.npz", **kept, **arrays)
+
+
+def counted(folder: Path) -> list[list[float]]:
+    """p_k of results of Kitchen, from their files."""
+    order = np.load(folder / "tasks.npz")["order"]
+    final = np.load(folder / "results.npz")["eval_returns"][:, :, -1]
+    lengths = (order >= 0).sum(axis=1)
+    searches = [(round(x * n), n) for row in final for x, n in zip(row, lengths, strict=True)]
+    most = int(lengths.max())
+    having = [[done >= k for done, n in searches if n >= k] for k in range(1, most + 1)]
+    return [[sum(each) / len(each), len(each)] for each in having]
 
 
 def change(path: Path, **changes: Any) -> None:
@@ -96,8 +126,98 @@ def test_the_published_table_is_that_of_the_results(
     assert capsys.readouterr().out == Path("results/table.md").read_text()
 
 
-def test_a_table_needs_no_jax() -> None:
-    assert call_without_jax(["table results/maze15/ucb results/kitchen/bpe"]) == ["0|False|"]
+def test_a_table_needs_no_jax(with_parts: Path) -> None:
+    """Only results of an older version that may be made of parts have to ask their world."""
+    lines = [f"table results/maze15/ucb results/gridworld/bpe {with_parts}"]
+    assert call_without_jax(lines) == ["0|False|"]
+
+
+@pytest.mark.parametrize("name", ["kitchen/ucb", "kitchen/grips", "ablations/kitchen/mixture/ucb"])
+def test_parts_of_older_results_are_counted(name: str) -> None:
+    """From the tasks and the returns of their single episodes."""
+    pytest.importorskip("mujoco")
+    row = read_row(RESULTS / name)
+    shares = row.summary["part_shares"]
+    assert shares is not None
+    np.testing.assert_allclose(shares, counted(RESULTS / name))
+    assert [num for _, num in shares] == [75, 75, 69, 57, 24]
+    found = cells(row)
+    assert list(found)[len(HEAD) :] == ["p1", "p2", "p3", "p4", "p5"]
+    if name == "kitchen/ucb":
+        wanted = ["1.00 (75)", "0.99 (75)", "0.97 (69)", "0.77 (57)", "0.46 (24)"]
+        assert list(found.values())[len(HEAD) :] == wanted
+
+
+def test_older_results_of_several_episodes_have_no_parts(tmp_path: Path) -> None:
+    """Neither by the world's record, nor by their settings."""
+    assert read_row(RESULTS / "gridworld" / "ucb").summary["part_shares"] is None
+    shutil.copytree(KITCHEN, tmp_path / "run")
+    change(tmp_path / "run" / "config.json", eval_episodes=10)
+    assert read_row(tmp_path / "run").summary["part_shares"] is None
+
+
+def test_parts_are_unknown_where_an_older_world_is_not_installed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def missing() -> None:
+        raise MissingExtraError("the kitchen needs mujoco")
+
+    monkeypatch.setattr(envs.kitchen, "import_mujoco", missing)
+    row = read_row(KITCHEN)
+    assert row.summary["part_shares"] is None
+    assert list(cells(row)) == list(HEAD)
+
+
+def test_a_table_has_columns_of_parts_where_a_row_has_them(with_parts: Path) -> None:
+    mazes, kitchen = read_row(ONE_PUBLISHED), read_row(with_parts)
+    assert list(cells(mazes)) == list(HEAD)
+    lines = [line.split(" | ") for line in comparison([mazes, kitchen]).splitlines()]
+    assert {len(line) for line in lines} == {len(HEAD) + 5}
+    assert lines[0][-5:] == ["p1", "p2", "p3", "p4", "p5 |"]
+    assert lines[2][-5:] == ["", "", "", "", " |"]
+    assert lines[3][-5:] == ["1.00 (75)", "0.99 (75)", "0.97 (69)", "0.77 (57)", "0.46 (24) |"]
+
+
+SHARES = counted(KITCHEN)
+FALSE_SHARES = {
+    "another share": [*SHARES[:4], [0.5, 24]],
+    "another number": [*SHARES[:4], [SHARES[4][0], 25]],
+    "one too few": SHARES[:4],
+    "one too many": [*SHARES, [1.0, 3]],
+    "unknown": None,
+}
+
+
+@pytest.mark.parametrize("name", FALSE_SHARES)
+def test_parts_are_those_of_the_results(with_parts: Path, name: str) -> None:
+    assert read_row(with_parts).summary["part_shares"] == [tuple(pair) for pair in SHARES]
+    change(with_parts / "summary.json", part_shares=FALSE_SHARES[name])
+    with pytest.raises(DataError, match=r"part_shares is .*, by results\.npz it is 1, 75, 0\.98"):
+        read_row(with_parts)
+
+
+def test_parts_need_single_episodes_and_their_numbers(with_parts: Path) -> None:
+    says = r"part_shares is 1, 75, .*, by results\.npz it is unknown; adapt again"
+    change(with_parts / "config.json", eval_episodes=10)
+    with pytest.raises(DataError, match=says):
+        read_row(with_parts)
+    change(with_parts / "config.json", eval_episodes=1)
+    assert read_row(with_parts).summary["part_shares"] is not None
+    write_parts(with_parts)
+    with pytest.raises(DataError, match=says):
+        read_row(with_parts)
+
+
+def test_parts_of_a_place_are_checked_where_they_are_told(with_parts: Path) -> None:
+    """How often its policies are judged is unknown, since it is not imported."""
+    for name in ("summary.json", "config.json"):
+        change(with_parts / name, env="no_such_module:WORLD", method="ucb")
+    assert cells(read_row(with_parts))["p5"] == "0.46 (24)"
+    change(with_parts / "summary.json", part_shares=None)
+    assert list(cells(read_row(with_parts))) == list(HEAD)
+    change(with_parts / "summary.json", part_shares=SHARES[:3])
+    with pytest.raises(DataError, match="part_shares is"):
+        read_row(with_parts)
 
 
 def test_a_policy_that_was_not_released_is_stated() -> None:
@@ -183,6 +303,11 @@ WRONG = {
     "too much": ({"solved_optimally": 7.3}, "solved_optimally must be at most 1, found 7.3"),
     "too little": ({"num_seeds": 0}, "num_seeds must be at least 1, found 0"),
     "half an interval": ({"final_return_iqm_95": [1.0]}, r"final_return_iqm_95"),
+    "a share above 1": ({"part_shares": [[1.5, 3]]}, "must be at most 1, found 1.5"),
+    "half a share": ({"part_shares": [[0.5]]}, r"part_shares"),
+    "a share of none": ({"part_shares": [[0.5, 0]]}, "must be at least 1, found 0"),
+    "no shares": ({"part_shares": []}, "part_shares must have at least 1 entries"),
+    "many shares": ({"part_shares": [[1.0, 3]] * 21}, "part_shares must have at most 20 entries"),
     "a list": ({"env": ["maze15"]}, r"env must be text, found \['maze15'\]"),
     "no world": ({"env": "maze51"}, "unknown world 'maze51'; did you mean 'maze15'"),
     "no method": ({"method": "ubc"}, "unknown method 'ubc'; did you mean 'ucb'"),

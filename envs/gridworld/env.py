@@ -107,6 +107,10 @@ class GridWorld(Environment):
         real = task.order != NONE
         return jnp.sum(jnp.where(real[1:], ways, 0)) + jnp.sum(real)
 
+    def num_parts(self, task: GridTask) -> Int[Array, ""]:
+        """The objects of the task."""
+        return jnp.sum(task.order != NONE)
+
     def fingerprint(self, task: GridTask) -> Int[Array, "F"]:
         """The order: a test order must not occur in training."""
         return task.order

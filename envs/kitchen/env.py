@@ -24,9 +24,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from envs.base import ArraySpec, Box, Engine, Environment, EnvSpec, TimeStep
+from envs.base import ArraySpec, Box, Engine, Environment, EnvSpec, State, Task, TimeStep
 from envs.kitchen.engines import BACKENDS, load_physics, resolve_backend
-from envs.kitchen.physics import CONTROL_PERIOD, MODELS, Physics, PhysicsState
+from envs.kitchen.physics import CONTROL_PERIOD, MODELS, Physics
 
 SUBTASKS = ("bottom burner", "light switch", "slide cabinet", "hinge cabinet", "microwave")
 NUM_SUBTASKS = len(SUBTASKS)
@@ -69,8 +69,10 @@ class KitchenTask(NamedTuple):
 class KitchenState(NamedTuple):
     """An episode in progress."""
 
-    task: KitchenTask
-    physics: PhysicsState
+    task: Task
+    """A ``KitchenTask``, or another task with an ``order``."""
+    physics: State
+    """A ``PhysicsState``, or what else has positions ``qpos`` and velocities ``qvel``."""
     completed: Bool[Array, "S"]
     """Subtasks that have been completed at least once."""
     newly: Bool[Array, "S"]
@@ -139,7 +141,7 @@ class Kitchen(Environment):
     def num_tasks(self) -> int:
         return len(_all_orders())
 
-    def sample_task(self, key: PRNGKeyArray) -> KitchenTask:
+    def sample_task(self, key: PRNGKeyArray) -> Task:
         """One of the 325 ordered tasks, uniformly (so most have 4 or 5 subtasks)."""
         return self.task(jax.random.randint(key, (), 0, self.num_tasks))
 
@@ -150,20 +152,24 @@ class Kitchen(Environment):
     def sample_goal(self, key: PRNGKeyArray) -> Float[Array, "G"]:
         return jax.nn.one_hot(jax.random.randint(key, (), 0, NUM_SUBTASKS), NUM_SUBTASKS)
 
-    def task_goal(self, task: KitchenTask) -> Float[Array, "G"]:
+    def task_goal(self, task: Task) -> Float[Array, "G"]:
         """The set of subtasks as a multi-hot vector; their order stays hidden."""
         return jax.nn.one_hot(task.order, NUM_SUBTASKS).sum(axis=0)
 
-    def optimal_return(self, task: KitchenTask) -> Float[Array, ""]:
+    def optimal_return(self, task: Task) -> Float[Array, ""]:
         """1: every order fits into the horizon."""
         del task
         return jnp.ones(())
 
-    def fingerprint(self, task: KitchenTask) -> Int[Array, "F"]:
+    def num_parts(self, task: Task) -> Int[Array, ""]:
+        """The subtasks of the task."""
+        return jnp.sum(task.order != NONE)
+
+    def fingerprint(self, task: Task) -> Int[Array, "F"]:
         """The order: a test order must not occur in training."""
         return task.order
 
-    def check_task(self, tasks: KitchenTask) -> None:
+    def check_task(self, tasks: Task) -> None:
         order = np.asarray(tasks.order)
         if order.ndim != 2 or order.shape[1] != NUM_SUBTASKS:
             raise ValueError(
@@ -184,14 +190,14 @@ class Kitchen(Environment):
             if len(np.unique(subtasks)) < len(subtasks):
                 raise ValueError(f"task {index}: a subtask occurs twice in {subtasks.tolist()}")
 
-    def reset(self, key: PRNGKeyArray, task: KitchenTask) -> tuple[KitchenState, TimeStep]:
+    def reset(self, key: PRNGKeyArray, task: Task) -> tuple[KitchenState, TimeStep]:
         """The arm in front of the closed kitchen, always at the same place."""
         del key
         none, zero = jnp.zeros(NUM_SUBTASKS, bool), jnp.zeros((), jnp.int32)
         no = jnp.zeros((), bool)
         state = KitchenState(
             task=task,
-            physics=jax.tree.map(jnp.asarray, self.physics.initial),
+            physics=self.initial_physics(task),
             completed=none,
             newly=none,
             num_solved=zero,
@@ -200,6 +206,11 @@ class Kitchen(Environment):
             done=no,
         )
         return state, self._observe(state, reward=jnp.zeros(()), complete=no)
+
+    def initial_physics(self, task: Task) -> State:
+        """Where an episode starts, the same for all tasks."""
+        del task
+        return jax.tree.map(jnp.asarray, self.physics.initial)
 
     def step(self, state: KitchenState, action: Float[Array, "9"]) -> tuple[KitchenState, TimeStep]:
         valid = jnp.all(jnp.isfinite(action))
@@ -236,13 +247,13 @@ class Kitchen(Environment):
         reward = jnp.where(in_order & ~state.done, 1.0 / num_subtasks, 0.0)
         return after, self._observe(after, reward, after.num_solved >= num_subtasks)
 
-    def control(self, physics: PhysicsState, action: Float[Array, "9"]) -> Float[Array, "9"]:
+    def control(self, physics: State, action: Float[Array, "9"]) -> Float[Array, "9"]:
         """Position targets of the actuators: an action moves them from where the joints are."""
         shift = MAX_SHIFT * jnp.clip(action, -1.0, 1.0)
         targets = physics.qpos[:NUM_ROBOT] + shift
         return jnp.clip(targets, jnp.array(TARGET_LOW), jnp.array(TARGET_HIGH))
 
-    def _at_target(self, physics: PhysicsState) -> Bool[Array, "S"]:
+    def _at_target(self, physics: State) -> Bool[Array, "S"]:
         """Which subtasks' joints are within the threshold of their targets."""
         counts, targets = _target_table()
         positions = self.physics.positions.expand(physics.qpos)
@@ -269,7 +280,7 @@ class Kitchen(Environment):
         )
 
 
-def _is_sane(physics: PhysicsState) -> Bool[Array, ""]:
+def _is_sane(physics: State) -> Bool[Array, ""]:
     """Whether a step of physics gave finite numbers of a credible size."""
     finite = [jnp.all(jnp.isfinite(leaf)) for leaf in physics]
     return jnp.all(jnp.stack(finite)) & jnp.all(jnp.abs(physics.qvel) < MAX_SPEED)

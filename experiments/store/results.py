@@ -79,6 +79,7 @@ FIELDS = {
     "eval_returns": _field("SNC", "float32"),
     "optimal_returns": _field("N", "float32", required=False),
     "task_goals": _field("NG", "float32", required=False),
+    "num_parts": _field("N", "integers", required=False, low=0),
     "lengths": _field("SNE", "integers", required=False, low=0),
     "keys": _field("SNE2", "uint32", required=False),
     "actions": _field("SNET*", "numbers", required=False),
@@ -116,7 +117,7 @@ class Results:
     eval_episodes: np.ndarray
     """[C]: after how many episodes the best choice was judged."""
     eval_returns: np.ndarray
-    """[S, N, C] mean returns of the judging episodes."""
+    """[S, N, C] mean returns of the judging episodes, of which nothing else is kept."""
     optimal_returns: np.ndarray
     """[N]; NaN where the optimum is unknown."""
     lengths: np.ndarray | None = None
@@ -164,6 +165,11 @@ class Results:
     def task_goals(self) -> np.ndarray:
         """[N, G] task goals g^M."""
         return np.asarray(jax.vmap(self.world.make().task_goal)(self.task_set))
+
+    @cached_property
+    def num_parts(self) -> np.ndarray:
+        """[N] numbers of equally rewarded parts of the tasks (``Environment.num_parts``)."""
+        return np.asarray(jax.jit(jax.vmap(self.world.make().num_parts))(self.task_set))
 
     def task(self, index: int) -> Task:
         """One task, with numpy leaves."""
@@ -268,6 +274,7 @@ def write_results(place: Path, results: Results, folder: Path, meta: Mapping[str
         "eval_episodes": results.eval_episodes,
         "eval_returns": results.eval_returns,
         "task_goals": results.task_goals,
+        "num_parts": results.num_parts,
         **{f"choice.{name}": array for name, array in results.choices.items()},
         **{f"best.{name}": array for name, array in results.best.items()},
     }
@@ -399,8 +406,8 @@ def load_results(folder: Path, parts: Collection[str] = PARTS) -> Results:
         summary=dict(read_summary(folder)),
         folder=folder,
     )
-    if "task_goals" in arrays:
-        vars(results)["task_goals"] = arrays["task_goals"]  # saves making the world
+    # Saves making the world; older versions did not keep them.
+    vars(results).update((n, arrays[n]) for n in ("task_goals", "num_parts") if n in arrays)
     return results
 
 

@@ -1,5 +1,6 @@
 """Adaptations in one table. Each row says what it is of: the tasks, the size, and the settings that differ
-from the defaults. Nothing here imports jax, and nothing that a file names is imported.
+from the defaults. Nothing here imports jax, except to ask a world about results of an older version, and no
+place that a file names is imported.
 """
 
 from __future__ import annotations
@@ -7,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,8 +19,15 @@ from envs.registry import WORLDS, World
 from experiments.store.layout import ARRAYS, CONFIG, SUMMARY, TASKS
 from experiments.store.paper import paper_value
 from experiments.store.settings import AdaptConfig
-from experiments.store.statistics import Interval, SeedSpread
-from experiments.store.summary import ADAPT_AGAIN, Summary, check_against, method_of, read_summary
+from experiments.store.statistics import Interval, PartShare, SeedSpread, part_shares
+from experiments.store.summary import (
+    ADAPT_AGAIN,
+    Summary,
+    check_against,
+    judged_once,
+    method_of,
+    read_summary,
+)
 from experiments.store.tables import number, shortened, table
 from mgpo_jax.methods import METHODS
 from mgpo_jax.released import released_folder
@@ -56,7 +65,6 @@ def read_row(folder: Path) -> Row:
       DataError: if a file is missing or damaged, or the files contradict each other.
     """
     summary = read_summary(folder)
-    check_against(folder / ARRAYS, summary)
     config = read_document(folder / CONFIG, dict[str, Any], ADAPT_AGAIN)
     made = (config.get("env"), config.get("method", config.get("bandit")))
     if made != (summary["env"], method_of(summary)):
@@ -65,12 +73,33 @@ def read_row(folder: Path) -> Row:
         )
     # A place is not imported: what it is of stays unknown.
     world = WORLDS.find(summary["env"]) if summary["env"] in WORLDS.names() else None
+    single = judged_once(config, world)
+    check_against(folder / ARRAYS, summary, single)
+    if "part_shares" not in summary:
+        summary["part_shares"] = _shares_of_older(folder, summary) if world and single else None
     return Row(
         folder=str(folder),
         summary=summary,
         tasks=kind_of_tasks(folder / TASKS, config, world),
         settings=changed_settings(config, summary, world),
     )
+
+
+def _shares_of_older(folder: Path, summary: Summary) -> list[tuple[float, int]] | None:
+    """p_k of single episodes of an older version, which kept no numbers of parts.
+
+    The world is asked for them, which needs jax, unless the returns cannot be shares of parts. Where what
+    the world needs is not installed, p_k are unknown.
+    """
+    if not (0 <= summary["initial_return"] <= 1 and 0 <= summary["final_return"] <= 1):
+        return None
+    from experiments.store.results import load_results
+
+    results = load_results(folder, parts=())
+    with suppress(ImportError):
+        shares = part_shares(results.eval_returns[:, :, -1], results.num_parts)
+        return None if shares is None else [(share, num) for share, num in shares]
+    return None
 
 
 def kind_of_tasks(path: Path, config: Mapping[str, Any], world: World | None) -> str:
@@ -147,8 +176,18 @@ HEAD = (
 
 
 def comparison(rows: Sequence[Row]) -> str:
-    """Adaptations beside the paper's Table 2, one row for each, in the order given."""
-    return table(HEAD, [_cells(row) for row in rows])
+    """Adaptations beside the paper's Table 2, one row for each, in the order given.
+
+    Where a row has p_k, there are columns for them, which stay empty in the rows without.
+    """
+    num = max((len(row.summary.get("part_shares") or ()) for row in rows), default=0)
+    head = (*HEAD, *(f"p{k}" for k in range(1, num + 1)))
+    return table(head, [_cells(row) + _share_cells(row, num) for row in rows])
+
+
+def _share_cells(row: Row, num: int) -> list[str]:
+    shares = row.summary.get("part_shares") or ()
+    return [str(PartShare(*pair)) for pair in shares] + [""] * (num - len(shares))
 
 
 def _cells(row: Row) -> list[str]:

@@ -17,6 +17,9 @@ from envs.errors import UsageError
 if TYPE_CHECKING:
     from experiments.store.results import Results
 
+MOST_PARTS = 20  # of a task, that are told apart
+WHOLE = 1e-3  # a number of parts may be off by this, since returns are sums of rounded rewards
+
 
 class Interval(NamedTuple):
     """A point estimate with a confidence interval, whose ends are None where there is none."""
@@ -70,6 +73,42 @@ def seed_spread(scores: np.ndarray) -> SeedSpread:
     """The paper's mean ± std of scores [S, N]."""
     means = scores.mean(axis=1)
     return SeedSpread(float(means.mean()), float(means.std()) if len(means) > 1 else None)
+
+
+class PartShare(NamedTuple):
+    """p_k, for a number k of parts."""
+
+    share: float
+    """Of the tasks and seeds with at least k parts, the share in which k were done in order."""
+    num: int
+    """How many tasks and seeds have at least k parts."""
+
+    def __str__(self) -> str:
+        return f"{self.share:.2f} ({self.num})"
+
+
+def part_shares(returns: np.ndarray, num_parts: np.ndarray) -> list[PartShare] | None:
+    """p_1, p_2, .. up to the most parts of a task, ``MOST_PARTS`` at most.
+
+    Args:
+      returns: [S, N] returns of single episodes. A mean of several does not tell how many parts were done
+        in how many of them.
+      num_parts: [N] numbers of equally rewarded parts of the tasks. Those without any (0) do not count.
+
+    Returns:
+      None if no task has parts, or if a return is no whole number of them.
+    """
+    having = num_parts > 0
+    if not having.any():
+        return None
+    exact, num_parts = returns[:, having] * num_parts[having], num_parts[having]
+    done = np.rint(exact)
+    whole = (np.abs(exact - done) <= WHOLE) & (done >= 0) & (done <= num_parts)
+    if not whole.all():
+        return None
+    ks = range(1, min(int(num_parts.max()), MOST_PARTS) + 1)
+    reached = [done[:, num_parts >= k] >= k for k in ks]
+    return [PartShare(float(those.mean()), those.size) for those in reached]
 
 
 class Comparison(NamedTuple):

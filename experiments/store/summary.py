@@ -8,16 +8,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NotRequired
 
 import numpy as np
-from annotated_types import Ge, Le, MaxLen
+from annotated_types import Ge, Le, MaxLen, MinLen
 from pydantic import with_config
 from typing_extensions import TypedDict
 
 from envs.errors import DataError, UsageError, nearest
-from envs.registry import WORLDS, Registry
+from envs.registry import WORLDS, Registry, World
 from experiments.store.layout import SUMMARY
 from experiments.store.statistics import (
+    MOST_PARTS,
     Interval,
+    PartShare,
     SeedSpread,
+    part_shares,
     seed_spread,
     stratified_bootstrap_iqm,
 )
@@ -37,6 +40,7 @@ DECIDING = {
     "eval_episodes": ArrayField(("C",), "int64", low=1),
     "eval_returns": ArrayField(("S", "N", "C"), "numbers"),
     "optimal_returns": ArrayField(("N",), "numbers", required=False),
+    "num_parts": ArrayField(("N",), "integers", required=False, low=0),
 }
 """The arrays of ``results.npz`` that a summary follows from."""
 PLACE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", re.ASCII)  # module:attribute
@@ -46,6 +50,7 @@ Tally = Annotated[int, Ge(0), Le(2**62)]
 Extent = Annotated[int, Ge(1), Le(2**62)]
 Amount = Annotated[float, Ge(0)]
 Fraction = Annotated[float, Ge(0), Le(1)]
+PartShares = Annotated[list[tuple[Fraction, Extent]], MinLen(1), MaxLen(MOST_PARTS)]
 
 
 @with_config(STRICT)
@@ -72,6 +77,10 @@ class Summary(TypedDict):
     regret_std_over_seeds: Amount | None
     regret_after_40: float | None
     solved_optimally: Fraction | None
+    part_shares: NotRequired[PartShares | None]
+    """p_1, p_2, .. of the optimized prompt, each with the number of tasks and seeds that it is of
+    (``statistics.part_shares``). None where tasks are not rewarded part by part, and where a judged return
+    is the mean of several episodes: only that mean is kept, which does not tell the parts of each."""
     failed_episodes: Tally
     best_episode_return: float
     cpu_seconds: Amount
@@ -89,6 +98,7 @@ def summarize(
     """The numbers of ``summary.json``."""
     solvable = solvable_tasks(results)
     optimum = results.optimal_returns if results.optimum_known else None
+    final, single = results.eval_returns[:, :, -1], judged_once(results.config, results.world)
     return {
         "env": results.env,
         "optimizer": results.method,
@@ -98,6 +108,7 @@ def summarize(
         **_of_returns(results.returns),
         **_of_judgements(results.eval_returns),
         **_against_optimum(results.eval_episodes, results.eval_returns, optimum, solvable),
+        "part_shares": part_shares(final, results.num_parts) if single else None,
         "failed_episodes": num_failed,
         "cpu_seconds": cpu_seconds,
         "episodes_per_cpu_second": num_episodes / cpu_seconds,
@@ -125,6 +136,14 @@ def _of_judgements(eval_returns: np.ndarray) -> dict[str, Any]:
         "final_return_iqm": iqm.value,
         "final_return_iqm_95": None if iqm.low is None else [iqm.low, iqm.high],
     }
+
+
+def judged_once(config: Mapping[str, Any], world: World | None) -> bool | None:
+    """Whether a judged return is of a single episode; None if only the world knows, which is not known."""
+    episodes = config.get("eval_episodes")
+    if episodes is None:
+        return None if world is None else world.judged.episodes == 1
+    return episodes == 1
 
 
 def solvable_tasks(results: Results) -> np.ndarray:
@@ -197,11 +216,17 @@ def _check_name(registry: Registry, name: str, path: Path) -> None:
         raise DataError(f"{path}: {error}; {ADAPT_AGAIN}") from None
 
 
-def check_against(path: Path, summary: Summary) -> None:
+def check_against(path: Path, summary: Summary, single: bool | None) -> None:
     """Raise ``DataError`` if a summary does not follow from the returns in ``results.npz``.
 
     Only their world knows which tasks nobody can solve. The summary says how many there are, and its share
     solved must be one that so many of them allow.
+
+    Args:
+      path: ``results.npz``.
+      summary: what is to follow from it.
+      single: whether the judged returns are of single episodes (``judged_once``). Where that is not known,
+        the summary may leave out its p_k.
     """
     arrays = read_arrays(path, DECIDING, dict.fromkeys("SNEC", range(1, 2**31)), ADAPT_AGAIN)
     judged, optimum = arrays["eval_returns"], arrays.get("optimal_returns")
@@ -219,6 +244,10 @@ def check_against(path: Path, summary: Summary) -> None:
         unsolvable = num_unsolvable / num_tasks
         least = max(0.0, most - unsolvable)
         expected["solved_optimally"] = float(np.clip(solved, least, min(most, 1 - unsolvable)))
+    if "part_shares" in found:  # older versions did not write them
+        known = "num_parts" in arrays and single is not False
+        shares = part_shares(judged[:, :, -1], arrays["num_parts"]) if known else None
+        expected["part_shares"] = None if single is None and not found["part_shares"] else shares
     for name, value in expected.items():
         if not _agree(found[name], value):
             raise DataError(
@@ -230,7 +259,8 @@ def check_against(path: Path, summary: Summary) -> None:
 def _agree(found: Any, expected: Any) -> bool:
     if found is None or expected is None:
         return found is expected
-    return bool(np.allclose(found, expected, rtol=CLOSE, atol=CLOSE))
+    same_shape = np.shape(found) == np.shape(expected)
+    return same_shape and bool(np.allclose(found, expected, rtol=CLOSE, atol=CLOSE))
 
 
 def _told(value: Any) -> str:
@@ -258,6 +288,9 @@ def printed(summary: Mapping[str, Any]) -> str:
             ("  after 40", "-" if after_40 is None else f"{after_40:.3f}"),
             ("solved optimally", f"{100 * summary['solved_optimally']:.0f} %"),
         ]
+    if shares := summary.get("part_shares"):
+        rows.append(("parts in order", "share with the first k done (tasks x seeds that have k)"))
+        rows += [(f"  p{k}", str(PartShare(*pair))) for k, pair in enumerate(shares, 1)]
     if unsolvable := summary.get("unsolvable_tasks"):
         rows.append(
             (
