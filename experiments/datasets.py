@@ -65,6 +65,8 @@ class Demonstration(NamedTuple):
 
     fingerprint: Int[Array, "*batch F"]
     episode: Episode
+    variant: Int[Array, "*batch"]
+    """Of the world; the demonstrator names them."""
     return_: Float[Array, "*batch"]
     """On the task that the trajectory happens to solve."""
     good: Bool[Array, "*batch"]
@@ -72,7 +74,9 @@ class Demonstration(NamedTuple):
 
 
 @cache
-def demonstration_program(env: Environment, sample_task: Any, agent: Any, judge: Any) -> Any:
+def demonstration_program(
+    env: Environment, sample_task: Any, agent: Any, judge: Any, variant: Any
+) -> Any:
     """``(keys, indices, weights) -> demonstrations``, compiled once a process."""
 
     def demonstrate(key: PRNGKeyArray, index: Array, weights: Any) -> Demonstration:
@@ -83,7 +87,7 @@ def demonstration_program(env: Environment, sample_task: Any, agent: Any, judge:
         keeps, hindsight_return = judge
         return_ = hindsight_return(episode.trajectory) if hindsight_return else episode.return_
         good = keeps(episode) & ~episode.failed
-        return Demonstration(env.fingerprint(task), episode, return_, good)
+        return Demonstration(env.fingerprint(task), episode, variant(task), return_, good)
 
     return together(env, demonstrate, in_axes=(0, 0, None))
 
@@ -91,7 +95,13 @@ def demonstration_program(env: Environment, sample_task: Any, agent: Any, judge:
 def program_of(env: Environment, demonstrator: Demonstrator) -> Any:
     """The program that demonstrates; the demonstrator's weights enter it as data."""
     judge = (demonstrator.keeps, demonstrator.hindsight_return)
-    return demonstration_program(env, demonstrator.sample_task, demonstrator.agent, judge)
+    return demonstration_program(
+        demonstrator.env or env,
+        demonstrator.sample_task,
+        demonstrator.agent,
+        judge,
+        demonstrator.variant,
+    )
 
 
 class _Attempts:
@@ -130,6 +140,7 @@ def _rows(found: Demonstration, hashes: np.ndarray, rows: np.ndarray) -> dict[st
         "task_hashes": hashes[rows],
         "rewards": episode.rewards[rows][real],
         "last_obs": episode.last_obs[rows],
+        "variants": found.variant[rows],
         "returns": found.return_[rows],
     }
 
@@ -219,6 +230,9 @@ def collect(
             progress.update(len(record["lengths"]))
     arrays = {name: np.concatenate([part[name] for part in kept]) for name in kept[0]}
     returns = arrays.pop("returns")
+    names = demonstrator.variants
+    if not names:
+        del arrays["variants"]
     dataset = Dataset(**arrays)
     facts = {
         "tried_again": attempts.num_again,
@@ -228,6 +242,9 @@ def collect(
         "at_horizon": float(np.mean(dataset.lengths == env.spec.horizon)),
         "hindsight_return": _describe(returns),
     }
+    if dataset.variants is not None:
+        counts = np.bincount(dataset.variants, minlength=len(names))
+        facts["variants"] = dict(zip(names, counts.tolist(), strict=True))
     return dataset, facts
 
 

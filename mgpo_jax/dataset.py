@@ -54,6 +54,7 @@ class Dataset:
     task_hashes: np.ndarray | None = None  # [N] uint64, of ``Environment.fingerprint``
     rewards: np.ndarray | None = None  # [total] float32
     last_obs: np.ndarray | None = None  # [N, ...], the observation after the last action
+    variants: np.ndarray | None = None  # [N] int32, of the world; the manifest names them in order
 
     @property
     def starts(self) -> np.ndarray:
@@ -139,6 +140,8 @@ class _Manifest(BaseModel):
     length: dict[str, Json] = {}
     at_horizon: Annotated[float, Ge(0), Le(1)] = 0
     hindsight_return: dict[str, Json] = {}
+    variants: dict[str, Index] = {}
+    """How many trajectories each variant of the world has, by its name, in the order of their indices."""
 
 
 def load_dataset(
@@ -225,6 +228,7 @@ def _fields(spec: EnvSpec | None) -> dict[str, ArrayField]:
         "task_hashes": ArrayField(("trajectory",), "uint64", required=False),
         "rewards": ArrayField(("step",), "float32", required=False),
         "last_obs": replace(obs, shape=("trajectory", *obs.shape[1:]), required=False),
+        "variants": ArrayField(("trajectory",), "int32", low=0, required=False),
     }
 
 

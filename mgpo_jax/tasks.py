@@ -59,10 +59,19 @@ def test_tasks(world: World | str) -> Task:
     return benchmark_tasks(env, world.num_test_tasks)
 
 
-def evaluation_tasks(env: Environment, num: int, num_test_tasks: int) -> Task:
-    """Tasks to watch a training or to choose settings by: none of them is a test task."""
+def evaluation_tasks(
+    env: Environment, num: int, num_test_tasks: int, tested: Environment | None = None
+) -> Task:
+    """Tasks to watch a training or to choose settings by: none of them is a test task.
+
+    Args:
+      env: the world that they are of.
+      num: how many there are.
+      num_test_tasks: how many tasks are kept for test.
+      tested: the world whose test tasks these are, where tasks of ``env`` have its fingerprints [``env``].
+    """
     drawn = sample_tasks(env, EVAL_SEED, 2 * num)
-    forbidden = task_hashes(env, benchmark_tasks(env, num_test_tasks))
+    forbidden = task_hashes(env, benchmark_tasks(tested or env, num_test_tasks))
     allowed = ~np.isin(task_hashes(env, drawn), forbidden)
     chosen = np.flatnonzero(allowed)[:num]
     if len(chosen) < num:

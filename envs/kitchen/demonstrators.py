@@ -14,6 +14,7 @@ The phases are in ``envs.kitchen.phases``; here is what carries them out.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
@@ -22,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from envs.base import Agent, Demonstrator, Episode, TimeStep, Trajectory
+from envs.base import Agent, Demonstrator, Episode, Task, TimeStep, Trajectory
 from envs.kitchen.arm import Arm, Pose, arm_pose, make_arm, rotation_vector, turn
 from envs.kitchen.env import (
     MAX_SHIFT,
@@ -34,7 +35,7 @@ from envs.kitchen.env import (
 )
 from envs.kitchen.extra import import_mujoco
 from envs.kitchen.phases import RETRY, Phase, Plan, make_plan
-from envs.kitchen.physics import CONTROL_PERIOD
+from envs.kitchen.physics import CONTROL_PERIOD, MODELS
 
 NUM_JOINTS = 7
 NOISE = 0.08  # standard deviation on the actions of arm and fingers
@@ -151,7 +152,7 @@ def scripted_arm(env: Kitchen, noise: float = NOISE) -> Agent:
     plan, robot = make_plan(), make_robot(env.model)
 
     def begin(
-        key: PRNGKeyArray, task: KitchenTask, state: KitchenState, timestep: TimeStep
+        key: PRNGKeyArray, task: Task, state: KitchenState, timestep: TimeStep
     ) -> tuple[Array, Array, Memory]:
         one = jnp.ones((), jnp.int32)
         memory = Memory(
@@ -166,7 +167,7 @@ def scripted_arm(env: Kitchen, noise: float = NOISE) -> Agent:
         key: PRNGKeyArray, memory: Memory, state: KitchenState, timestep: TimeStep
     ) -> tuple[Array, Array, Memory]:
         del timestep
-        sight = look(robot, env.physics.positions.expand(state.physics.qpos))
+        sight = look(robot, jnp.asarray(env.physics.positions.expand(state.physics.qpos)))
         over = is_over(robot.scene, current_phase(plan, memory), memory, sight)
         memory = advance(plan, memory, over, next_subtask(state))
         action = act(robot, current_phase(plan, memory), memory.subtask, sight)
@@ -177,21 +178,64 @@ def scripted_arm(env: Kitchen, noise: float = NOISE) -> Agent:
 
 
 def kitchen_demonstrators(env: Kitchen) -> dict[str, Demonstrator]:
-    """The dataset: every ordered task in turn (paper: 300 of them, 30 episodes each)."""
+    """Those of a kitchen. All go through every ordered task in turn (paper: 300 of them, 30 episodes each).
+
+    ``expert`` demonstrates in both scenes, with the reduced one's physics drawn for each episode. The others
+    demonstrate in one scene as it is, with one engine. A world that names an engine or the stock scene has
+    its own one first.
+    """
     import_mujoco()  # complains now and not in the middle of a program
+    engine = "native" if env.backend == "native" else "auto"
+    known = {
+        "expert": in_both_scenes(env),
+        "expert-reduced": in_one_scene(replace(env, backend=engine, model="reduced")),
+        "expert-stock": in_one_scene(replace(env, backend="native", model="stock")),
+        "expert-mjx": in_one_scene(replace(env, backend="mjx", model="reduced")),
+    }
+    first = "expert"
+    if env.backend == "mjx":
+        first = "expert-mjx"
+    if env.model == "stock":
+        first = "expert-stock"
+    return {first: known.pop(first), **known}
+
+
+def in_one_scene(place: Kitchen) -> Demonstrator:
+    """The demonstrator in one world."""
 
     def task_in_turn(key: PRNGKeyArray, index: Int[Array, ""]) -> KitchenTask:
         del key
-        return env.task(index)
+        return place.task(index)
 
-    expert = Demonstrator(
+    return Demonstrator(
         sample_task=task_in_turn,
-        agent=lambda weights: scripted_arm(env),
+        agent=lambda weights: scripted_arm(place),
         keeps=is_perfect,
         hindsight_return=perfect_return,
         settings=(("noise", NOISE),),
+        env=place,
     )
-    return {"expert": expert}
+
+
+def in_both_scenes(env: Kitchen) -> Demonstrator:
+    """The demonstrator in a scene that is drawn for each episode. It does not know what was drawn."""
+    from envs.kitchen import varied
+
+    place = varied.VariedKitchen(name=env.name, horizon=env.horizon)
+
+    def task_in_turn(key: PRNGKeyArray, index: Int[Array, ""]) -> varied.VariedTask:
+        return place.varied(key, env.task(index))
+
+    return Demonstrator(
+        sample_task=task_in_turn,
+        agent=lambda weights: scripted_arm(place),
+        keeps=is_perfect,
+        hindsight_return=perfect_return,
+        settings=(("noise", NOISE), *varied.settings(place)),
+        env=place,
+        variants=MODELS,
+        variant=place.scene,
+    )
 
 
 def is_perfect(episode: Episode) -> Bool[Array, "*batch"]:

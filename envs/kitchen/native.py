@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from threading import Lock
 from typing import Any
 
@@ -22,11 +23,20 @@ WORLDS_PER_THREAD = 8  # with fewer, waking the thread takes longer than the wor
 
 
 class Stepper:
-    """Steps any number of worlds of one model; callers may be on several threads."""
+    """Steps any number of worlds of one model; callers may be on several threads.
 
-    def __init__(self, model: mujoco.MjModel, num_substeps: int) -> None:
+    Args:
+      model: the model.
+      num_substeps: steps of MuJoCo in a control step.
+      fields: names of fields of the model that each world has its own values of.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, num_substeps: int, fields: Sequence[str] = ()
+    ) -> None:
         self.model = model
         self.num_substeps = num_substeps
+        self.fields = fields
         self.sizes = (model.nq, model.nv, model.nv)
         self._idle: dict[int, list[Batch]] = defaultdict(list)
         self._lock = Lock()
@@ -41,14 +51,32 @@ class Stepper:
         # Converted to numpy first: a jax operation inside of a callback may wait for the very program that
         # waits for the callback.
         flat = np.asarray(rows).reshape(-1, rows.shape[-1])
-        before = flat[:, :width]
-        active = flat[:, -1] > 0
-        batch = self._take(len(flat))
+        after = self.step(flat[:, :width], flat[:, width:-1], flat[:, -1] > 0)
+        return after.reshape(*rows.shape[:-1], width)
+
+    def step(
+        self,
+        before: Float[np.ndarray, "B N"],
+        ctrl: Float[np.ndarray, "B U"],
+        active: Bool[np.ndarray, "B"],
+        values: Mapping[str, np.ndarray] | None = None,
+    ) -> Float[np.ndarray, "B N"]:
+        """The states of B worlds after a control step; those that are not active stay as they are.
+
+        Args:
+          before: positions, velocities and warm starts.
+          ctrl: position targets of the actuators.
+          active: which worlds to step.
+          values: of the fields that each world has its own of, ``[B, ...]`` each.
+        """
+        batch = self._take(len(before))
         names = ("qpos", "qvel", "qacc_warmstart")
         views = [batch.bind(name) for name in names]
         for view, part in zip(views, np.split(before, np.cumsum(self.sizes)[:-1], 1), strict=True):
             view[:] = part
-        batch.bind("ctrl")[:] = flat[:, width:-1]
+        batch.bind("ctrl")[:] = ctrl
+        for name, value in (values or {}).items():
+            batch.expand(name)[:] = value
         failed = np.zeros(0, int)
         try:
             if active.any():
@@ -59,7 +87,7 @@ class Stepper:
         after[failed] = np.nan
         after[~active] = before[~active]
         self._give_back(batch)
-        return after.reshape(*rows.shape[:-1], width)
+        return after
 
     def _take(self, num: int) -> Batch:
         with self._lock:
@@ -74,15 +102,21 @@ class Stepper:
             self._idle[batch.nsim].append(batch)
 
 
-def native_physics(name: str) -> Physics:
-    """The C engine with the model ``reduced`` or ``stock``."""
+def silence_warnings() -> None:
+    """Let diverged worlds be flagged in their states alone; MuJoCo would also write a log to the folder."""
     if mujoco.get_mju_user_warning() is None:
-        # A diverged world is flagged in its state; MuJoCo would also write a log to the working folder.
         mujoco.set_mju_user_warning(lambda message: None)
-    model = load_model(name)
-    stepper = Stepper(model, SUBSTEPS[name])
-    width = sum(stepper.sizes)
-    splits = tuple(np.cumsum(stepper.sizes)[:-1].tolist())
+
+
+def in_programs(
+    stepper: Callable[[Array | np.ndarray], np.ndarray], width: int
+) -> Callable[[Float[Array, "N"]], Float[Array, "M"]]:
+    """A function of numpy arrays ``[..., N] -> [..., M]`` for one row, to be used in jitted programs.
+
+    Args:
+      stepper: the function.
+      width: M.
+    """
 
     # For CPU devices: a pure_callback copies large arguments on the threads of the device. These may all be
     # waiting for the callback, which then never begins. A buffer_callback copies nothing.
@@ -90,15 +124,26 @@ def native_physics(name: str) -> Physics:
         del context
         np.asarray(out)[...] = stepper(np.asarray(rows))
 
+    def call(row: Float[Array, "N"]) -> Float[Array, "M"]:
+        result = jax.ShapeDtypeStruct((width,), jnp.float32)
+        if jax.default_backend() == "cpu":
+            return buffer_callback(write, result, vmap_method="expand_dims")(row)
+        return jax.pure_callback(stepper, result, row, vmap_method="expand_dims")
+
+    return call
+
+
+def native_physics(name: str) -> Physics:
+    """The C engine with the model ``reduced`` or ``stock``."""
+    silence_warnings()
+    stepper = Stepper(load_model(name), SUBSTEPS[name])
+    splits = tuple(np.cumsum(stepper.sizes)[:-1].tolist())
+    call = in_programs(stepper, sum(stepper.sizes))
+
     def advance(
         state: PhysicsState, ctrl: Float[Array, "9"], active: Bool[Array, ""]
     ) -> PhysicsState:
-        row = jnp.concatenate([*state, ctrl, active[None].astype(jnp.float32)])
-        result = jax.ShapeDtypeStruct((width,), jnp.float32)
-        if jax.default_backend() == "cpu":
-            after = buffer_callback(write, result, vmap_method="expand_dims")(row)
-        else:
-            after = jax.pure_callback(stepper, result, row, vmap_method="expand_dims")
+        after = call(jnp.concatenate([*state, ctrl, active[None].astype(jnp.float32)]))
         return PhysicsState._make(jnp.split(after, splits))
 
     positions, velocities = scene_coordinates(name)

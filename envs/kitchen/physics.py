@@ -7,13 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 MODELS = ("reduced", "stock")
 CONTROL_PERIOD = 0.08  # s
+
+Either = Array | np.ndarray
 
 
 class PhysicsState(NamedTuple):
@@ -39,8 +41,8 @@ class Coordinates(NamedTuple):
     scale: Float[np.ndarray, "N"]
     base: Float[np.ndarray, "N"]
 
-    def expand(self, q: Float[Array, "M"]) -> Float[Array, "N"]:
-        return self.base + self.scale * q[self.source]
+    def expand(self, q: Float[Either, "*batch M"]) -> Float[Either, "*batch N"]:
+        return self.base + self.scale * q[..., self.source]
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +55,7 @@ class Physics:
     """To the 30 positions of the full scene."""
     velocities: Coordinates
     """To the 29 velocities of the full scene."""
-    advance: Callable[[PhysicsState, Float[Array, "9"], Bool[Array, ""]], PhysicsState]
+    advance: Callable[[Any, Float[Array, "9"], Bool[Array, ""]], Any]
     """``(state, position targets of the actuators, whether it matters) -> state`` after 0.08 s.
 
     Where the result does not matter, since an episode has ended, an engine may return it unchanged."""
