@@ -16,6 +16,7 @@ from jaxtyping import Array, PRNGKeyArray
 import envs
 from envs.base import Demonstrator, Environment, Task
 from envs.episodes import run_episode
+from envs.errors import DataError
 from envs.registry import World
 from experiments.datasets import find_demonstrator, prepare_dataset
 from experiments.figures import training_curve
@@ -23,13 +24,18 @@ from experiments.signals import Stopped, asked_to_stop, farewell
 from experiments.store import runs
 from experiments.store.metrics import METRICS, Metrics, check_loggers, salvaged_rows
 from experiments.store.provenance import provenance
-from experiments.store.settings import PretrainConfig
+from experiments.store.settings import (
+    PretrainConfig,
+    check_initial,
+    initial_folder,
+    mend_initial,
+)
 from mgpo_jax.checkpoint import Snapshot, checkpoints, restore_state, save_state
 from mgpo_jax.claims import claimed
 from mgpo_jax.dataset import BatchPlan, Dataset
 from mgpo_jax.files import remove_unfinished, to_json, written
-from mgpo_jax.policy import transformer_policy
-from mgpo_jax.policy_files import save_policy
+from mgpo_jax.policy import LoadedPolicy, transformer_policy
+from mgpo_jax.policy_files import MEND, read_policy, save_policy
 from mgpo_jax.progress import Progress
 from mgpo_jax.prompts import Prompt, sample_prompt, single_goal
 from mgpo_jax.rollout import Query, rollout
@@ -43,10 +49,30 @@ CONSTANT = 1e-4  # below this standard deviation a component of an observation s
 PERFECT = 1e-3  # a demonstration whose return is this near to the optimum counts as perfect
 
 
+def initial_policy(config: PretrainConfig, env: Environment) -> LoadedPolicy | None:
+    """The policy that a run starts from; None if it starts from random weights.
+
+    Raises:
+      UsageError: if there is none at its place, or the settings contradict its network.
+      DataError: if it is damaged, of another world, or not the one that a resumed run started from.
+    """
+    if config.init is None:
+        return None
+    try:
+        policy = read_policy(initial_folder(config), env.spec)
+    except DataError as error:
+        raise DataError(str(error).replace(MEND, mend_initial(config))) from None
+    runs.check_same_start(config, policy.sha256)
+    check_initial(config)
+    return policy
+
+
 def configured_network(
-    config: PretrainConfig, env: Environment, dataset: Dataset
+    config: PretrainConfig, env: Environment, dataset: Dataset, init: LoadedPolicy | None = None
 ) -> TransformerConfig:
-    """The network of a run: its settings are those that both configs have."""
+    """The network of a run: that of the policy it starts from, or one of the settings both configs have."""
+    if init is not None:
+        return replace(init.config, dropout=config.dropout)
     common = {f.name for f in fields(TransformerConfig)} & {f.name for f in fields(PretrainConfig)}
     network = network_config(env.spec, **{name: getattr(config, name) for name in common})
     if not config.standardize_obs:
@@ -59,12 +85,12 @@ def configured_network(
 
 
 class GreedyEvaluation:
-    """Mean greedy returns on tasks of its own, none of them a test task.
+    """Mean greedy returns on tasks of its own, none of them a test task, where the data were collected.
 
     ``initial`` is the return of the prompt (g^M); ``followed`` that of a prompt drawn from a perfect
     demonstration of the task, which says how well the policy does what a good prompt tells it. The latter
     is missing where most demonstrations are not perfect (in mazes the demonstrator goes after goals of its
-    own) and where the optimum is unknown.
+    own) and where the optimum is unknown. Where the world has variants, each has its own mean as well.
     """
 
     def __init__(
@@ -75,30 +101,35 @@ class GreedyEvaluation:
         demonstrator: Demonstrator,
         num: int,
     ) -> None:
-        self.tasks = evaluation_tasks(env, num, world.num_test_tasks)
-        self.optimum = jax.jit(jax.vmap(env.optimal_return))(self.tasks)
+        place = demonstrator.env or env
+        self.tasks = evaluation_tasks(place, num, world.num_test_tasks, tested=env)
+        self.optimum = jax.jit(jax.vmap(place.optimal_return))(self.tasks)
         self.keys = jax.random.split(jax.random.key(EVAL_SEED), (3, num))
+        variants = np.asarray(jax.vmap(demonstrator.variant)(self.tasks))
+        self._variants = {
+            f"_{name}": variants == index for index, name in enumerate(demonstrator.variants)
+        }
         num_slots = network.max_prompt_length
 
         def demonstrated(
             key: PRNGKeyArray, key_prompt: PRNGKeyArray, task: Task, weights: Any
         ) -> tuple[Prompt, Array]:
-            episode = run_episode(key, env, demonstrator.agent(weights), task)
+            episode = run_episode(key, place, demonstrator.agent(weights), task)
             goals = episode.trajectory.goals
             confirmed = goals.goal_reached & (episode.rewards > 0)
-            kept = confirmed if env.spec.reward_confirms_goals else None
-            prompt = sample_prompt(key_prompt, goals, env.task_goal(task), num_slots, kept=kept)
+            kept = confirmed if place.spec.reward_confirms_goals else None
+            prompt = sample_prompt(key_prompt, goals, place.task_goal(task), num_slots, kept=kept)
             return prompt, episode.return_
 
         def greedy_return(params: Any, key: PRNGKeyArray, task: Task, prompt: Prompt) -> Array:
             policy = transformer_policy(network, params)
-            return rollout(key, env, policy, task, Query(prompt, jnp.ones((), bool))).return_
+            return rollout(key, place, policy, task, Query(prompt, jnp.ones((), bool))).return_
 
-        self._returns = together(env, greedy_return, in_axes=(None, 0, 0, 0))
-        self._initial = jax.vmap(lambda task: single_goal(env.task_goal(task), num_slots))(
+        self._returns = together(place, greedy_return, in_axes=(None, 0, 0, 0))
+        self._initial = jax.vmap(lambda task: single_goal(place.task_goal(task), num_slots))(
             self.tasks
         )
-        demonstrate = together(env, demonstrated, in_axes=(0, 0, 0, None))
+        demonstrate = together(place, demonstrated, in_axes=(0, 0, 0, None))
         self._followed, returns = demonstrate(
             self.keys[0], self.keys[1], self.tasks, demonstrator.weights
         )
@@ -106,14 +137,20 @@ class GreedyEvaluation:
 
     def __call__(self, params: Any) -> dict[str, float]:
         """The numbers for some weights."""
-        initial = self._returns(params, self.keys[2], self.tasks, self._initial)
-        found = {"eval/initial_return": float(initial.mean())}
+        initial = np.asarray(self._returns(params, self.keys[2], self.tasks, self._initial))
+        everything = np.ones(len(initial), bool)
+        found = self._means("eval/initial_return", initial, everything)
         if np.isfinite(self.optimum).all():
-            found["eval/initial_regret"] = float(jnp.mean(self.optimum - initial))
+            found["eval/initial_regret"] = float(np.mean(np.asarray(self.optimum) - initial))
         if self._perfect.mean() > 0.5:
-            followed = self._returns(params, self.keys[2], self.tasks, self._followed)
-            found["eval/followed_return"] = float(np.asarray(followed)[self._perfect].mean())
+            followed = np.asarray(self._returns(params, self.keys[2], self.tasks, self._followed))
+            found |= self._means("eval/followed_return", followed, self._perfect)
         return found
+
+    def _means(self, name: str, values: np.ndarray, counts: np.ndarray) -> dict[str, float]:
+        """The mean of what counts, of all tasks and of those of each variant."""
+        groups = {"": counts, **{tail: counts & one for tail, one in self._variants.items()}}
+        return {name + tail: float(values[one].mean()) for tail, one in groups.items() if one.any()}
 
 
 class Run:
@@ -125,11 +162,12 @@ class Run:
     def __init__(self, config: PretrainConfig, go_on: str) -> None:
         self.config, self.folder = config, config.folder
         world, env = envs.find(config.env), envs.make(config.env)
+        self.init = init = initial_policy(config, env)
         network_config(env.spec, config.head, encoder=config.encoder)  # complains about a bad one
         check_loggers(config)
         meta = provenance()
         dataset, place, sha256 = prepare_dataset(config, world, env, go_on)
-        self.network = configured_network(config, env, dataset)
+        self.network = configured_network(config, env, dataset, init)
         self.mesh = device_mesh(largest_divisor(config.train.part_size, len(jax.devices())))
         cut = len(dataset) - config.holdout
         self.fit, held_out = dataset.slice(0, cut), dataset.slice(cut, len(dataset))
@@ -139,12 +177,22 @@ class Run:
         self._held_out_parts = self._validation_parts(held_out, env.spec.horizon)
         _, demonstrator = find_demonstrator(world, env, config.data.demonstrator)
         self._greedy = GreedyEvaluation(world, env, self.network, demonstrator, config.eval_tasks)
-        self.identity = runs.identity(config, sha256)
-        meta = {**meta, "dataset": str(place), "dataset_sha256": sha256}
+        self.identity = runs.identity(config, sha256, init.sha256 if init else "")
+        meta = {**meta, "dataset": str(place), "dataset_sha256": sha256, **self.origin}
         if runs.has_begun(self.folder):
             runs.check_same(config, meta)
+            runs.keep_initial(config, meta)
         else:  # only now, after everything that could be wrong with the settings
             runs.begin(config, meta)
+
+    @property
+    def origin(self) -> dict[str, str]:
+        """What the files of the run say of the weights that it started from."""
+        return {"init_sha256": self.init.sha256} if self.init else {}
+
+    def initial_state(self) -> TrainState:
+        """The state before the first step."""
+        return self.trainer.init(self.init.params if self.init else None)
 
     def _validation_parts(self, held_out: Dataset, horizon: int) -> list[BatchPlan]:
         """Draws of one padded length; the validation loss is of the same ones every time."""
@@ -198,7 +246,7 @@ def train(config: PretrainConfig, go_on: str = "continue with --resume") -> None
                 return
         run = Run(config, go_on)
         with checkpoints(run.folder / runs.CHECKPOINTS) as manager:
-            blank = run.trainer.init()
+            blank = run.initial_state()
             before = restore_state(manager, blank, run.identity) if config.resume else None
             before = before or Snapshot(blank, [], [])
             rows = before.measured
@@ -210,7 +258,7 @@ def train(config: PretrainConfig, go_on: str = "continue with --resume") -> None
             metrics = Metrics(run.folder, config, rows)
             with asked_to_stop() as stopping:
                 state = _take_steps(run, before, metrics, manager, stopping, go_on)
-        made = {"env": config.env, "config": to_json(config), "steps": state.step}
+        made = {"env": config.env, "config": to_json(config), "steps": state.step, **run.origin}
         policy = run.folder / runs.POLICY
         save_policy(policy, run.network, state.params, made)
         with written(run.folder / runs.PICTURE) as picture:

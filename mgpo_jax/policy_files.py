@@ -211,6 +211,7 @@ class _Made(BaseModel):
     env: Name | None = None
     config: dict[str, Json] | None = None
     steps: Index | None = None
+    init_sha256: Sha256 | None = None
 
 
 class _Config(NamedTuple):

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 from pydantic import PydanticUserError
 
-from envs.errors import UsageError, nearest
+from envs.errors import UsageError, nearest, shown
 from mgpo_jax.schema import LIMITS, fault
 
 # Numbers enter programs with 32 bits. Sizes have upper bounds where more could only fill the memory.
@@ -123,6 +123,33 @@ def range_of(annotation: Any) -> str:
 
 RECIPE_NETWORK: dict[str, Any] = {"dropout": 0.0, "num_heads": 4}
 """How the network of the general recipe differs from the paper's (Table 6)."""
+
+OF_WEIGHTS = (
+    "max_prompt_length", "prompt_order", "embed_dim", "num_layers", "num_heads", "encoder", "head"
+)  # fmt: skip
+"""Settings of a network that its weights were made for; dropout is none, since it only trains."""
+
+
+def check_contradictions(
+    given: Mapping[str, Any],
+    network: Mapping[str, Any],
+    where: str,
+    mend: str = "leave it out",
+) -> None:
+    """Raise ``UsageError`` for the first setting of a network that its weights were not made for.
+
+    Args:
+      given: settings by name, as a user wants them; None for one that is left open.
+      network: those that belong to the weights; others are not looked at.
+      where: whose weights they are, for the message.
+      mend: what mends it, the end of the message.
+    """
+    for name, value in given.items():
+        if name in network and value not in (None, network[name]):
+            switch = flag(name) if value else flag(name).replace("--", "--no-", 1)
+            wanted = switch if isinstance(value, bool) else f"{flag(name)} {shown(value)}"
+            found = f"{name} {shown(network[name])}"
+            raise UsageError(f"{wanted} contradicts {where}, whose network has {found}; {mend}")
 
 
 @dataclass(frozen=True)

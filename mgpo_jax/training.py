@@ -9,6 +9,7 @@ from a checkpoint equals one that was never interrupted, bit for bit.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -23,10 +24,15 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray
 from envs.base import EnvSpec, Trajectory
 from envs.errors import DataError, UsageError
 from mgpo_jax.dataset import BatchPlan, Dataset, check_dataset, plan_batches
-from mgpo_jax.policy import LoadedPolicy
+from mgpo_jax.policy import LoadedPolicy, check_fits
 from mgpo_jax.progress import Progress
 from mgpo_jax.prompts import hindsight_outcome, sample_prompt, single_goal
-from mgpo_jax.settings import RECIPE_NETWORK, TrainConfig, check_settings
+from mgpo_jax.settings import (
+    RECIPE_NETWORK,
+    TrainConfig,
+    check_contradictions,
+    check_settings,
+)
 from mgpo_jax.sharding import (
     device_mesh,
     fetch,
@@ -304,12 +310,14 @@ class Trainer:
 
         self._part_keys, self._part_stats = part_keys, part_stats
 
-    def init(self) -> TrainState:
-        """The state before the first step."""
+    def init(self, params: Any = None) -> TrainState:
+        """The state before the first step, with given weights of the network or with random ones."""
         # A GPU would compile 160 small programs one after the other, so it gets two large ones. They round
         # differently: on CPUs, where the published policies were trained, the small ones are kept.
         compiled = (lambda function: function) if jax.default_backend() == "cpu" else jax.jit
-        params = compiled(self._initial_params)()
+        # Given weights are copied, since the first step gives the memory of its weights away.
+        make = compiled(self._initial_params)
+        params = make() if params is None else jax.tree.map(jnp.array, params)
         return TrainState(params, compiled(self._optimizer.init)(self._flatten(params)), 0)
 
     def step(
@@ -378,10 +386,31 @@ def batch_stream(
     )
 
 
+def continued_network(
+    config: TransformerConfig, changes: Mapping[str, Any], where: str
+) -> TransformerConfig:
+    """The network of a training that starts from the weights of another one.
+
+    Args:
+      config: the network of the weights.
+      changes: settings by name; all but ``dropout`` (default: that of the recipe) must be as they are.
+      where: whose weights they are, for messages.
+
+    Raises:
+      UsageError: if a setting contradicts the weights.
+    """
+    dropout = changes.get("dropout", RECIPE_NETWORK["dropout"])
+    others = {name: value for name, value in changes.items() if name != "dropout"}
+    replace(config, **others)  # complains about a name that is none
+    check_contradictions(others, {name: getattr(config, name) for name in others}, where)
+    return replace(config, dropout=dropout)
+
+
 def pretrain(
     dataset: Dataset,
     spec: EnvSpec,
     config: TrainConfig | None = None,
+    init: LoadedPolicy | None = None,
     **network: Any,
 ) -> LoadedPolicy:
     """Pre-train a policy on a dataset, in memory and from the first step to the last.
@@ -393,19 +422,26 @@ def pretrain(
       dataset: trajectories of the world.
       spec: the world's facts.
       config: how to train (default: that of ``TrainConfig``).
+      init: a policy whose network and weights training starts from (default: random weights). Only
+        ``dropout`` can be another one then.
       **network: sizes and options of the network, as in ``TransformerConfig``, that differ from the
         recipe's (``settings.RECIPE_NETWORK``: no dropout and four heads).
 
     Raises:
-      DataError: if the dataset does not fit the world, or a loss or weight is not finite any more.
-      UsageError: if a setting is out of its bounds.
+      DataError: if the dataset or ``init`` does not fit the world, or a loss or weight is not finite any
+        more.
+      UsageError: if a setting is out of its bounds, or contradicts ``init``.
     """
     config = config or TrainConfig()
     check_dataset(dataset, "dataset", spec)
-    sizes = network_config(spec, **{**RECIPE_NETWORK, **network})
+    if init is None:
+        sizes = network_config(spec, **{**RECIPE_NETWORK, **network})
+    else:
+        check_fits(init.config, spec, "the policy given as init")
+        sizes = continued_network(init.config, network, "the policy given as init")
     mesh = device_mesh(largest_divisor(config.part_size, len(jax.devices())))
     trainer = Trainer(config, sizes, dataset, mesh)
-    state = trainer.init()
+    state = trainer.init(None if init is None else init.params)
     batches = batch_stream(config, dataset, spec.truncate_in_hindsight, mesh.devices.size)
     before: dict[str, Any] = {}
     with Progress(config.steps, "step") as progress:
@@ -415,4 +451,7 @@ def pretrain(
             before = metrics
             progress.update()
     finite_metrics(state.step, before)
-    return LoadedPolicy(sizes, state.params, {"steps": config.steps})
+    made: dict[str, Any] = {"steps": config.steps}
+    if init is not None and init.sha256:
+        made["init_sha256"] = init.sha256
+    return LoadedPolicy(sizes, state.params, made)

@@ -661,7 +661,8 @@ def test_a_continuous_world_from_data_to_release(
 
     def of_single_subtasks(env: Any) -> Any:
         sample = lambda key, index: env.task(index % 5)  # noqa: E731
-        return {"expert": kitchen.demonstrators(env)["expert"]._replace(sample_task=sample)}
+        known = kitchen.demonstrators(env)["expert-reduced"]
+        return {"expert-reduced": known._replace(sample_task=sample)}
 
     short = replace(
         kitchen,
@@ -678,7 +679,7 @@ def test_a_continuous_world_from_data_to_release(
     code, text = command(f"{line} --out run")
     assert code == 0, text
     network = read_policy(Path("run/policy")).config
-    dataset, manifest = load_dataset(Path("data/kitchen/expert-24-seed0"))
+    dataset, manifest = load_dataset(Path("data/kitchen/expert-reduced-24-seed0"))
     assert manifest["settings"] == {"noise": demonstrators.NOISE}
     assert network.head == "binned"
     np.testing.assert_allclose(network.obs_mean, dataset.obs.mean(axis=0), atol=1e-3)
@@ -698,7 +699,7 @@ def test_a_continuous_world_from_data_to_release(
     assert command("release run --out packed") == (0, "released in packed\n")
     assert "share within 0.1 in all dimensions" in Path("packed/README.md").read_text()
 
-    path = Path("data/kitchen/expert-24-seed0/manifest.json")
+    path = Path("data/kitchen/expert-reduced-24-seed0/manifest.json")
     path.write_text(json.dumps({**manifest, "settings": {"noise": 0.5}}))
     code, text = command(f"{line} --out other")
     assert code == 1

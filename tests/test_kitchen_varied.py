@@ -130,9 +130,7 @@ def test_fields_by_hand():
     shift = fields["geom_pos"][0] - model.geom_pos
     moved = {model.geom(int(geom)).name for geom in np.flatnonzero(np.abs(shift).sum(axis=1))}
     assert moved == {"microwave handle", "microwave door"}
-    np.testing.assert_allclose(
-        shift[model.geom("microwave door").id], [0.01, -0.005, 0], atol=1e-8
-    )
+    np.testing.assert_allclose(shift[model.geom("microwave door").id], [0.01, -0.005, 0], atol=1e-8)
 
 
 def test_draws_stay_within_what_is_stated():

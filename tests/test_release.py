@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -93,6 +94,17 @@ def test_a_release_that_breaks_off_leaves_nothing(
     assert release()[0] == 0
 
 
+def test_the_card_names_the_policy_that_a_training_began_from(run: Path, release: Release) -> None:
+    card = run.with_name("packed") / "README.md"
+    assert release()[0] == 0
+    assert "began from" not in card.read_text()
+    shutil.rmtree(card.parent)
+    configured(config=CONTINUED, init_sha256="0a" * 32)(run)
+    assert release()[0] == 0
+    row = f"| began from | the weights of the policy the/first\\n, SHA-256 {'0a' * 32} |"
+    assert row in card.read_text().splitlines()
+
+
 def configured(**changes: Any) -> Callable[[Path], Any]:
     """Change entries of ``made`` in the config of the run's policy."""
 
@@ -109,6 +121,7 @@ def written(name: str, text: str) -> Callable[[Path], Any]:
     return lambda run: (run / name).write_text(text)
 
 
+CONTINUED = to_json(PretrainConfig(env="gridworld", init=Path("the/first\n")))
 CUT = json.dumps({"step": 2, **ROW}) + '\n{"step": 4, "trai'
 DAMAGES = {
     "another world": (configured(env="maze15"), "has obs_shape (9,), maze15 needs (6,)"),
@@ -118,6 +131,14 @@ DAMAGES = {
     "settings of another world": (
         configured(config=to_json(PretrainConfig(env="maze15"))),
         "made.env is 'gridworld', made.config.env is 'maze15'",
+    ),
+    "no hash of the weights that it began from": (
+        configured(config=CONTINUED),
+        "has made.config.init, but lacks made.init_sha256",
+    ),
+    "a hash that is none": (
+        configured(config=CONTINUED, init_sha256="ab"),
+        "made.init_sha256 must be a SHA-256, 64 hexadecimal digits, found 'ab'",
     ),
     "no settings": (configured(config=[]), "made.config must be an object, found []"),
     "no metrics": (lambda run: (run / "metrics.jsonl").unlink(), "metrics.jsonl is missing"),

@@ -31,7 +31,7 @@ CARD = """# Multi-goal Transformer for {env}
 | --- | --- |
 | network | {num_layers} layers, width {embed_dim}, {num_heads} head(s), {num_weights:,} weights |
 | prompts | up to {max_prompt_length} goals, {order} |
-| data | {trajectories:,} demonstrations of {demonstrator}, seed {data_seed} |
+| data | {trajectories:,} demonstrations of {demonstrator}, seed {data_seed} |{begun}
 | training | {steps:,} steps of {batch_size} trajectories, {optimizer}, {cpu_minutes:.0f} CPU-minutes |
 | validation loss | {val_loss:.4f} nats an action, {correct} {val_accuracy:.4f} |
 | greedy return of the prompt (g^M) | {initial:.3f} on {eval_tasks} tasks of the training's own |
@@ -91,6 +91,8 @@ def read_run(source: Path, env: str | None = None) -> Finished:
         raise UsageError(f"--env {env}, but the policy in {source} was made for {name}")
     check_fits(policy.config, world.make().spec, f"the policy in {source}")
     config = pretraining_from(settings, path)
+    if config.init is not None and "init_sha256" not in policy.made:
+        raise DataError(f"{path} has made.config.init, but lacks made.init_sha256; {RESUME}")
     if config.env != name:
         raise DataError(
             f"{path}: made.env is {shown(name)}, made.config.env is {shown(config.env)}; {RESUME}"
@@ -123,6 +125,7 @@ def card(run: Finished) -> str:
         trajectories=settings.data.trajectories,
         demonstrator=find_demonstrator(run.world, env, settings.data.demonstrator)[0],
         data_seed=settings.data.data_seed,
+        begun=_begun(run),
         steps=last["step"],
         batch_size=settings.train.batch_size,
         optimizer=settings.train.optimizer,
@@ -135,6 +138,14 @@ def card(run: Finished) -> str:
         eval_tasks=settings.eval_tasks,
         command=printable(run.command),
     )
+
+
+def _begun(run: Finished) -> str:
+    """The row of a card that says which policy a training began from; empty for random weights."""
+    if run.settings.init is None:
+        return ""
+    place, sha256 = printable(str(run.settings.init)), run.policy.made["init_sha256"]
+    return f"\n| began from | the weights of the policy {place}, SHA-256 {sha256} |"
 
 
 def release(run: Finished, folder: Path) -> None:

@@ -1,8 +1,9 @@
 """The folder of a pre-training run: when a run may start there, and what a resumed run must agree on.
 
-It holds ``config.json`` (the settings), ``meta.json`` (how and with what it was made), ``metrics.jsonl``,
-``checkpoints`` and, when it is finished, ``policy`` and ``training.png``. A run has begun where there is a
-``config.json``: a start writes it last. Nothing here imports jax.
+It holds ``config.json`` (the settings), ``meta.json`` (how and with what it was made), ``init`` (a copy of
+the policy that it started from, if any), ``metrics.jsonl``, ``checkpoints`` and, when it is finished,
+``policy`` and ``training.png``. A run has begun where there is a ``config.json``: a start writes it last.
+Nothing here imports jax.
 """
 
 from __future__ import annotations
@@ -11,20 +12,30 @@ import hashlib
 import json
 import os
 import re
+import shutil
 import sys
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any
 
 from envs.errors import DataError, UsageError, printable, shown
-from experiments.store.settings import PretrainConfig, saved_pretraining, training_settings
+from experiments.store.settings import (
+    INIT,
+    PretrainConfig,
+    goes_on,
+    initial_at,
+    initial_folder,
+    read_initial,
+    saved_pretraining,
+    training_settings,
+)
 from mgpo_jax.claims import LOCK, check_place
-from mgpo_jax.files import TEMPORARY, write_json
+from mgpo_jax.files import TEMPORARY, hash_file, remove_unfinished, write_json, written
 from mgpo_jax.schema import Json, read_document
 
 CONFIG, META, CHECKPOINTS, POLICY = "config.json", "meta.json", "checkpoints", "policy"
-PICTURE = "training.png"
+PICTURE, WEIGHTS = "training.png", "weights.npz"
 OLD_PARTIAL = "config.json.partial"  # what older versions were writing when they were killed
 ROOM = 32 << 20  # bytes that must be free before a training starts: a few small checkpoints
 
@@ -37,7 +48,7 @@ def has_begun(folder: Path) -> bool:
 def is_finished(folder: Path) -> bool:
     """Whether a run has trained to its end and written its policy."""
     # The picture is the last thing that is written.
-    names = (f"{POLICY}/config.json", f"{POLICY}/weights.npz", PICTURE)
+    names = (f"{POLICY}/{CONFIG}", f"{POLICY}/{WEIGHTS}", PICTURE)
     return all(os.path.isfile(folder / name) for name in names)
 
 
@@ -68,37 +79,96 @@ def check_start(config: PretrainConfig) -> None:
 
 def _holds_nothing(folder: Path) -> bool:
     """Whether a folder holds only what a run leaves behind that was killed before it began."""
-    own = (LOCK, META, OLD_PARTIAL)
+    own = {LOCK, META, OLD_PARTIAL}
+    if (folder / META).is_file() and _holds_only(folder / INIT, {WEIGHTS, CONFIG}):
+        own.add(INIT)  # which is written after META
+    return _holds_only(folder, own)
+
+
+def _holds_only(folder: Path, names: Set[str]) -> bool:
+    """Whether a folder holds nothing but files of some names, and what a killed process was writing."""
     return folder.is_dir() and all(
-        path.name in own or path.name.startswith(TEMPORARY) for path in folder.iterdir()
+        path.name in names or path.name.startswith(TEMPORARY) for path in folder.iterdir()
     )
 
 
-def identity(config: PretrainConfig, dataset_sha256: str) -> str:
-    """A hash of everything that determines the weights of a run, except for the machine."""
+def identity(config: PretrainConfig, dataset_sha256: str, init_sha256: str = "") -> str:
+    """A hash of everything that determines the weights of a run, except for the machine.
+
+    Args:
+      config: settings of the run.
+      dataset_sha256: the hash of its dataset.
+      init_sha256: that of the weights that it starts from; empty for random ones.
+    """
     usual = training_settings(PretrainConfig())
     # Those that have their defaults are left out, so that settings which are added later change nothing.
     settings = {k: v for k, v in training_settings(config).items() if v != usual[k]}
-    text = json.dumps([settings, dataset_sha256], sort_keys=True)
+    hashes = [dataset_sha256, init_sha256] if init_sha256 else [dataset_sha256]
+    text = json.dumps([settings, *hashes], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def begin(config: PretrainConfig, meta: dict[str, Any]) -> None:
-    """Note what a new run is."""
+    """Note what a new run is, with a copy of the policy that it starts from.
+
+    Raises:
+      DataError: if that policy was replaced since it was read.
+    """
     (config.folder / OLD_PARTIAL).unlink(missing_ok=True)
     write_json(config.folder / META, meta)
+    if config.init is None:  # what a start from a policy has left that was killed
+        shutil.rmtree(config.folder / INIT, ignore_errors=True)
+    keep_initial(config, meta)
     write_json(config.folder / CONFIG, config)
 
 
+def keep_initial(config: PretrainConfig, meta: Mapping[str, Any]) -> None:
+    """Copy the policy that a run starts from into its folder, unless it was read from there.
+
+    A run can then be resumed when that policy has been replaced, as a release does, and anywhere.
+
+    Raises:
+      DataError: if the policy was replaced since it was read, or a file is where the copy should be.
+    """
+    if config.init is None or (source := initial_folder(config)) == config.folder / INIT:
+        return
+    place = config.folder / INIT
+    if place.exists() and not place.is_dir():
+        raise DataError(f"{place} is no folder; remove it, and --init is read again")
+    place.mkdir(exist_ok=True)
+    remove_unfinished(place)
+    for name in (WEIGHTS, CONFIG):
+        with written(place / name) as partial:
+            shutil.copyfile(source / name, partial)
+    if hash_file(place / WEIGHTS) != meta["init_sha256"]:
+        raise DataError(f"the policy in {source} was replaced just now; run the same command again")
+
+
 def check_settings(config: PretrainConfig) -> None:
-    """Raise ``UsageError`` if a run that is resumed was started with other settings."""
+    """Raise ``UsageError`` if a run that is resumed was started with other settings or other weights."""
     folder = config.folder
-    before = training_settings(saved_pretraining(folder / CONFIG))
-    if changed := changes(before, training_settings(config)):
+    saved = saved_pretraining(folder / CONFIG)
+    before, now = training_settings(saved), training_settings(config)
+    if starts_elsewhere(saved, config):
+        before |= {"init": saved.init and str(saved.init)}
+        now |= {"init": config.init and str(config.init)}
+    if changed := changes(before, now):
         raise UsageError(
             f"{folder} was started with other settings: {changed}; give the same ones, or start a new run "
             "with --out"
         )
+
+
+def starts_elsewhere(saved: PretrainConfig, config: PretrainConfig) -> bool:
+    """Whether a run that is resumed was started from other weights than its settings say now.
+
+    A place that was named at the start as well is not looked at: a run has a copy of what was there.
+    """
+    if saved.init == config.init:
+        return False
+    if saved.init is None or config.init is None:
+        return True
+    return initial_at(config.init).sha256 != read_initial(config).sha256
 
 
 def check_same(config: PretrainConfig, meta: dict[str, Any]) -> None:
@@ -110,11 +180,9 @@ def check_same(config: PretrainConfig, meta: dict[str, Any]) -> None:
       DataError: if it was started on another dataset.
     """
     folder = config.folder
-    if not (folder / META).is_file():
+    if not (saved := _saved_meta(folder)):
         write_json(folder / META, meta)
         return
-    mend = f"remove {folder / META}, and it is written again"
-    saved = read_document(folder / META, dict[str, Json], mend)
     hash_before, hash_now = saved.get("dataset_sha256"), meta["dataset_sha256"]
     if hash_before not in (None, hash_now):
         raise DataError(
@@ -122,6 +190,29 @@ def check_same(config: PretrainConfig, meta: dict[str, Any]) -> None:
             f"now has {hash_now[:12]}..; collect it again as it was, or start a new run with --out"
         )
     say_what_differs(saved, meta, str(folder))
+
+
+def check_same_start(config: PretrainConfig, init_sha256: str) -> None:
+    """Check that a run which is resumed, if it has begun, started from the weights with a hash.
+
+    Raises:
+      DataError: if it started from others.
+    """
+    before = _saved_meta(config.folder).get("init_sha256") if goes_on(config) else None
+    if before not in (None, init_sha256):
+        raise DataError(
+            f"{config.folder} was started from weights with the hash {shown(before)[:13]}.., those in "
+            f"{initial_folder(config)} have {init_sha256[:12]}..; put the policy back there, or start a "
+            "new run with --out"
+        )
+
+
+def _saved_meta(folder: Path) -> dict[str, Any]:
+    """How and with what a run was made; empty if that file is gone."""
+    if not (folder / META).is_file():
+        return {}
+    mend = f"remove {folder / META}, and it is written again"
+    return read_document(folder / META, dict[str, Json], mend)
 
 
 def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:

@@ -12,16 +12,19 @@ import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import tyro
+from pydantic import BaseModel
 
 import envs
 from envs.errors import DataError, UsageError, nearest, shown
 from experiments.runtime import Common
+from experiments.store.layout import CONFIG
 from mgpo_jax.methods import NoHyper
-from mgpo_jax.schema import Json, read_document
+from mgpo_jax.schema import STRICT, Json, Sha256, read_document
 from mgpo_jax.settings import (
+    OF_WEIGHTS,
     RECIPE_NETWORK,
     Count,
     Encoder,
@@ -37,6 +40,7 @@ from mgpo_jax.settings import (
     Share,
     TrainConfig,
     Width,
+    check_contradictions,
     flag,
     get_parts,
     setting_fault,
@@ -98,6 +102,8 @@ class PretrainConfig(Common):
     """Where the defaults below come from: fast, paper or smoke."""
     data: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
     train: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
+    init: Path | None = None
+    """Folder of a policy whose network and weights training starts from (default: random weights)."""
     max_prompt_length: NumGoals = 5
     """K, the longest prompt [5]."""
     dropout: Share = RECIPE_NETWORK["dropout"]
@@ -198,19 +204,106 @@ def pretrain_preset(env: str, preset: str) -> PretrainConfig:
     if preset not in PRESETS:
         raise nearest(preset, PRESETS, "preset")
     config = PretrainConfig(env=env, preset=preset)
-    if preset not in world.presets:  # it starts from the world's fast one
+    own = world.presets.get(preset, {})
+    smoke = preset == "smoke"
+    if smoke or not own:  # it starts from the world's fast one
         config = with_settings(config, world.presets.get("fast", {}))
     config = with_settings(config, PRESETS[preset])
-    config = with_settings(config, world.presets.get(preset, {}))
-    if preset == "smoke" and preset not in world.presets:
-        # Few padded lengths, so that little is compiled.
+    if smoke:  # few padded lengths, so that little is compiled
         config = with_settings(config, {"bucket": 8 * config.train.bucket})
-    return config
+    return with_settings(config, own)
 
 
 def pretrain_default(config: PretrainConfig, flags: Iterable[str] = ()) -> PretrainConfig:
-    """The defaults that the world and the preset of a config choose, whatever else it says."""
-    return pretrain_preset(config.env, config.preset)
+    """The defaults that the world and the preset of a config choose, and the policy that it starts from.
+
+    Raises:
+      UsageError: if there is no such world, preset or policy.
+      DataError: if the config of the policy is damaged, or that of a run that is resumed.
+    """
+    default = pretrain_preset(config.env, config.preset)
+    if config.init is None:
+        return default
+    if goes_on(config):
+        run = saved_pretraining(config.folder / CONFIG)
+        return with_settings(default, {name: getattr(run, name) for name in OF_INITIAL})
+    return with_settings(default, read_initial(config).network)
+
+
+INIT = "init"
+"""The folder in that of a run where the policy lies that it started from."""
+OF_INITIAL = (*OF_WEIGHTS, "standardize_obs")
+"""The settings of a training that belong to the policy that it starts from."""
+MEND_INIT = "give the folder of another policy with --init, such as RUN/policy"
+
+
+class Initial(NamedTuple):
+    """What is known of a policy to start from before its weights are read."""
+
+    network: dict[str, Any]
+    """Those settings of a training that belong to it (``OF_INITIAL``), by name."""
+    sha256: str
+    """Of its weights."""
+
+
+class _PolicyConfig(BaseModel):
+    """What is read of the ``config.json`` of a policy; there are other entries."""
+
+    model_config = {**STRICT, "extra": "ignore"}
+
+    sha256: Sha256
+    network: dict[str, Json]
+
+
+def goes_on(config: PretrainConfig) -> bool:
+    """Whether a config resumes a run that has begun."""
+    return config.resume and os.path.isfile(config.folder / CONFIG)
+
+
+def initial_folder(config: PretrainConfig) -> Path:
+    """Where the policy lies that a training starts from; a run that is resumed has a copy of its own.
+
+    Only for a config with ``init``.
+    """
+    assert config.init is not None
+    kept = config.folder / INIT
+    return kept if goes_on(config) and os.path.isfile(kept / CONFIG) else config.init
+
+
+def mend_initial(config: PretrainConfig) -> str:
+    """What mends a damaged policy to start from, the end of a message."""
+    folder = initial_folder(config)
+    return MEND_INIT if folder == config.init else f"remove {folder}, and --init is read again"
+
+
+def read_initial(config: PretrainConfig) -> Initial:
+    """The config of the policy that a training starts from, as ``initial_at``."""
+    return initial_at(initial_folder(config), mend_initial(config))
+
+
+def initial_at(folder: Path, mend: str = MEND_INIT) -> Initial:
+    """The config of a policy to start from.
+
+    Args:
+      folder: where it lies.
+      mend: what mends a damaged one, the end of the message.
+
+    Raises:
+      UsageError: if there is no policy in the folder.
+      DataError: if its config is damaged.
+    """
+    path = folder / CONFIG
+    if not os.path.isfile(path):
+        raise UsageError(f"no policy in {folder} ({CONFIG} is missing); {mend}")
+    document: _PolicyConfig = read_document(path, _PolicyConfig, mend)
+    general = PretrainConfig()  # older policies lack settings that had one value then
+    network = {name: document.network.get(name, getattr(general, name)) for name in OF_WEIGHTS}
+    types = types_of(PretrainConfig)
+    for name, value in network.items():
+        if said := setting_fault(types[name], value):
+            raise DataError(f"{path}: network.{name} {said}; {mend}")
+    network["standardize_obs"] = bool(document.network.get("obs_mean"))
+    return Initial(network, document.sha256)
 
 
 def check_pretraining(config: PretrainConfig) -> None:
@@ -220,7 +313,10 @@ def check_pretraining(config: PretrainConfig) -> None:
         raise UsageError(
             f"--batch-size {train.batch_size} is not a multiple of --part-size {train.part_size}"
         )
-    if config.embed_dim % config.num_heads:
+    if config.init is not None:
+        if not goes_on(config):
+            check_initial(config)
+    elif config.embed_dim % config.num_heads:
         raise UsageError(
             f"--embed-dim {config.embed_dim} is not a multiple of --num-heads {config.num_heads}"
         )
@@ -231,10 +327,19 @@ def check_pretraining(config: PretrainConfig) -> None:
         )
 
 
+def check_initial(config: PretrainConfig) -> None:
+    """Raise ``UsageError`` for settings of a network that the policy to start from was not made for."""
+    folder, network = initial_folder(config), read_initial(config).network
+    given = {name: getattr(config, name) for name in network}
+    mend = "leave it out" if folder == config.init else mend_initial(config)
+    check_contradictions(given, network, f"the policy in {folder}", mend)
+
+
 NO_SETTINGS = frozenset(
-    {"preset", "out", "resume", "debug", "tb", "wandb", "eval_every", "save_every"}
+    {"preset", "init", "out", "resume", "debug", "tb", "wandb", "eval_every", "save_every"}
 )
-"""Settings that may differ when a run is resumed: they do not change its weights."""
+"""Settings that may differ when a run is resumed: they do not change its weights. For the place of the
+policy to start from, the hash of its weights counts."""
 
 
 def training_settings(config: PretrainConfig) -> dict[str, Any]:

@@ -79,7 +79,7 @@ SUMMARY = JsonTraits(
     shares=("solved_optimally",),
     names=("env", "method"),
     nullable=("optimal_return", "regret", "regret_*", "solved_optimally", "method", "optimizer",
-              "policy_sha256", "final_return_std_over_seeds", "final_return_iqm*"),
+              "policy_sha256", "final_return_std_over_seeds", "final_return_iqm*", "part_shares"),
     texts=("policy_sha256",),
 )  # fmt: skip
 MANIFEST = JsonTraits(
@@ -140,7 +140,10 @@ PRETRAIN = (
     "--part-size 4 --bucket 64 --eval-tasks 2 --steps 4 --save-every 2 --eval-every 2"
 )
 RESUME = f"{PRETRAIN} --out run --resume"
+ON = f"{PRETRAIN} --init policy".replace("--embed-dim 8 --num-layers 1 ", "")
+RESUME_ON = f"{ON} --out begun --resume"
 PLOT = "result --out new"
+CHECK = "result --out new.json"
 OF_DATASET = ("trajectories.npz", "was collected by")
 OF_POLICY = ("weights.npz", "policy is not", "policy of", "no finished policy")
 DATASET = "data/maze15/astar4-40-seed0"
@@ -154,6 +157,9 @@ FILES = (
     FileKind("evaluate", "result", "result", "config.json", RESULT_CONFIG, 2, ("policy",), ("weights",)),
     FileKind("evaluate", "result", "result", "summary.json", NOTHING, 1, ("policy",)),
     FileKind("evaluate", "result", "result", "meta.json", NOTHING, 1, ("policy",)),
+    FileKind("check", CHECK, "policy", "config.json", POLICY, 1, ("result",), OF_POLICY),
+    FileKind("check", CHECK, "result", "results.npz", RESULT_ARRAYS, 1, ("policy",)),
+    FileKind("check", CHECK, "result", "config.json", RESULT_CONFIG, 1, ("policy",), ("weights",)),
     FileKind("plot", PLOT, "result", "results.npz", RESULT_ARRAYS, 4, ("policy",)),
     FileKind("plot", PLOT, "result", "tasks.npz", MAZES, 2, ("policy",)),
     FileKind("plot", PLOT, "result", "config.json", RESULT_CONFIG, 3, ("policy",), ("weights",)),
@@ -168,6 +174,9 @@ FILES = (
     FileKind("pretrain", RESUME, "run", "meta.json", NOTHING, 1, ("data",), ("run",)),
     FileKind("pretrain", RESUME, "run", "metrics.jsonl", None, 2, ("data",)),
     FileKind("pretrain", RESUME, "run", "checkpoints", None, 2, ("data",)),
+    FileKind("pretrain", ON, "policy", "config.json", POLICY, 2, ("data",), OF_POLICY),
+    FileKind("pretrain", ON, "policy", "weights.npz", WEIGHTS, 2, ("data",), OF_POLICY),
+    FileKind("pretrain", RESUME_ON, "begun", "init", None, 2, ("data", "policy"), ("begun/init",)),
     FileKind("reproduce", "table4 --seeds 1 --out old", "old", "maze15/table4/K1-1seeds", None, 2),
     FileKind("release", "run --out new", "run/policy", "config.json", POLICY, 2, ("run",), OF_POLICY),
     FileKind("release", "run --out new", "run/policy", "weights.npz", WEIGHTS, 1, ("run",), OF_POLICY),
@@ -269,6 +278,31 @@ def _checkpoints(rng: np.random.Generator, kind: FileKind, data: bytes) -> Damag
     return Damage(name, expected, do, BOTH)
 
 
+def _other_weights_in(folder: Path) -> None:
+    """Sound weights with their hash, which are not those that were there."""
+    path = folder / "weights.npz"
+    arrays = {name: 2 * array for name, array in read(path).items()}
+    _mended(written(saved(arrays)), ("config.json", "sha256"))(path)
+
+
+def _copied_policy(rng: np.random.Generator, kind: FileKind, data: bytes) -> Damage:
+    """Damage to the copy of the policy that a run started from; without one, that is read again."""
+    damages: dict[str, tuple[Callable[[Path], None], Expected]] = {
+        "a file": (_swap, "refused"),
+        "of empty files": (_each_file(lambda path: path.write_bytes(b"")), "refused"),
+        "of cut files": (_each_file(_halve), "refused"),
+        "with other weights": (_other_weights_in, "refused"),
+        "without weights.npz": (lambda folder: (folder / "weights.npz").unlink(), "refused"),
+        "without config.json": (lambda folder: (folder / "config.json").unlink(), "accepted"),
+        "without files": (_each_file(Path.unlink), "accepted"),
+        "missing": (shutil.rmtree, "accepted"),
+        "with one flipped bit": (_one_file(rng), "either"),
+    }
+    name = pick(rng, list(damages))
+    do, expected = damages[name]
+    return Damage(name, expected, do, BOTH)
+
+
 def _old_result(rng: np.random.Generator, kind: FileKind, data: bytes) -> Damage:
     """A result in the place of a row of a table that does not belong there."""
     damages: dict[str, Callable[[Path], None]] = {
@@ -288,6 +322,7 @@ OTHERS: dict[str, Callable[[np.random.Generator, FileKind, bytes], Damage]] = {
     "metrics.jsonl": _lines,
     "checkpoints": _checkpoints,
     "K1-1seeds": _old_result,
+    "init": _copied_policy,
 }
 """Damage to files that are neither JSON nor npz, by their names."""
 
@@ -428,7 +463,7 @@ def file_case(rng: np.random.Generator, sound: Path) -> Case:
     hashed = (
         kind.traits.hash_in[0] if isinstance(kind.traits, NpzTraits) and kind.traits.hash_in else ""
     )
-    resumed = ("run",) if "--resume" in kind.words else ()
+    resumed = (kind.folder,) if "--resume" in kind.words else ()
     weights = sound / "run/policy/weights.npz"
     needs = {name.split("/")[0] for name in (kind.folder, *kind.also)}
     return Case(

@@ -38,7 +38,7 @@ BASE: dict[str, tuple[str, tuple[str, ...]]] = {
     "pretrain": (
         "--preset smoke --trajectories 40 --holdout 8 --embed-dim 8 --num-layers 1 --batch-size 8 "
         "--part-size 4 --bucket 64 --eval-tasks 2 --steps 4 --out new",
-        ("data",),
+        ("data", "policy"),
     ),
     "adapt": (
         "--policy policy --tasks tasks.npz --seeds 1 --episodes 10 --eval-episodes 1 --no-figures "
@@ -46,6 +46,7 @@ BASE: dict[str, tuple[str, tuple[str, ...]]] = {
         ("policy", "tasks.npz"),
     ),
     "evaluate": ("result --obs-noise 0.1 --json new.json", ("result", "policy")),
+    "check": ("result --out new.json", ("result", "policy")),
     "table": ("result", ("result",)),
     "plot": ("result --out new", ("result", "policy")),
     "reproduce": ("table4 --seeds 1 --out new", ()),
@@ -69,6 +70,12 @@ CONTRADICTIONS: dict[str, tuple[tuple[str, str], ...]] = {
         ("--head gaussian", "head"),
         ("--demonstrator nobody", "demonstrator"),
         ("--resume --out nothing --demonstrator nobody", "demonstrator"),
+        ("--init policy --embed-dim 16", "--embed-dim"),
+        ("--init policy --max-prompt-length 6", "--max-prompt-length"),
+        ("--init policy --no-prompt-order", "--no-prompt-order"),
+        ("--init policy --standardize-obs", "--standardize-obs"),
+        ("--init policy --env gridworld", "policy"),
+        ("--init result", "result"),
     ),
     "adapt": (
         ("--validation", "--tasks"),
@@ -86,9 +93,11 @@ CONTRADICTIONS: dict[str, tuple[tuple[str, str], ...]] = {
     "evaluate": (
         ("--env gridworld", "gridworld"),
         ("--env mgpo_jax.methods:UCB", "UCB"),
+        ("--obs-noise official", "official"),
         ("nowhere", "nowhere"),
         ("policy", "policy"),
     ),
+    "check": (("--env gridworld", "gridworld"), ("nowhere", "nowhere"), ("policy", "policy")),
     "table": (("nowhere", "nowhere"), ("result nowhere", "nowhere"), ("policy", "policy")),
     "plot": (
         ("--seed 1", "--seed"),
@@ -112,7 +121,14 @@ CONTRADICTIONS: dict[str, tuple[tuple[str, str], ...]] = {
 
 VALID: dict[str, tuple[str, ...]] = {
     "collect": ("--env maze15", "--demonstrator astar4 --env maze15", "--env=maze15"),
-    "pretrain": ("--head categorical", "--part-size 8", "--learning_rate 1e-2", "--warmup-steps 0"),
+    "pretrain": (
+        "--head categorical",
+        "--part-size 8",
+        "--learning_rate 1e-2",
+        "--warmup-steps 0",
+        "--init policy",
+        "--init=policy/ --embed-dim 8 --dropout 0.5",
+    ),
     "adapt": (
         "--method bpe --min-std 0.1",
         "--bandit bbt",
@@ -127,6 +143,7 @@ VALID: dict[str, tuple[str, ...]] = {
         "--figures",
     ),
     "evaluate": ("--obs-noise 0 --action-noise 0.5", "--episodes 1", "--env maze15"),
+    "check": ("--env maze15",),
     "table": ("result", "result/"),
     "plot": ("--tasks 0", "--tasks 1 0", "--seed 0"),
     "reproduce": ("table5 --only astar4", "--seeds 2", "figure8 --only 5 10"),

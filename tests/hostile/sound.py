@@ -1,4 +1,4 @@
-"""Sound material for the fuzz suite: a policy, a result, tasks, a dataset and a finished run, all tiny."""
+"""Sound material for the fuzz suite, all tiny: policy, result, tasks, dataset, a done and a begun run."""
 
 from __future__ import annotations
 
@@ -58,6 +58,11 @@ def _make() -> None:
     with replaced(EVALUATION):
         run("pretrain", PRETRAIN)
     shutil.copytree("run/policy", "policy")
+    with replaced(EVALUATION):
+        run("pretrain", PRETRAIN.replace("--out run", "--out begun --init policy"))
+    for name in ("policy", "checkpoints"):  # as if it had been killed before its first checkpoint
+        shutil.rmtree(f"begun/{name}")
+    Path("begun/training.png").unlink()
     leaves = named_leaves(test_tasks("maze15"), "task")
     arrays = {name: np.asarray(leaf)[:NUM_TASKS] for name, leaf in leaves.items()}
     np.savez_compressed("tasks.npz", allow_pickle=False, **arrays)

@@ -105,11 +105,19 @@ def test_a_torn_run_goes_on_by_itself(
     reference.check(half, PRETRAIN)
 
 
+def half_a_copy(run: Path) -> None:
+    (run / "meta.json").write_text("{}")
+    (run / "init").mkdir()
+    for name in ("weights.npz", ".writing-0a.json"):
+        (run / "init" / name).write_text("half")
+
+
 UNBEGUN = {
     "an empty folder": lambda run: None,
     "half a config": lambda run: (run / "config.json.partial").write_text("{"),
     "a file that was being written": lambda run: (run / ".writing-0a.json").write_text("{"),
     "no config": lambda run: (run / "meta.json").write_text("{}"),
+    "half a copy of a policy": half_a_copy,
     "a lock of a dead process": lambda run: (run / ".lock").write_text("1 on nowhere\n"),
 }
 
@@ -181,6 +189,8 @@ FAILED_STARTS = [
     ("--embed-dim 8", "--embed-dim 0"),
     ("--steps 20", "--steps 20 --seed 100000000000000000000"),
     ("--steps 20", "--steps 20 --tb"),
+    ("--steps 20", "--steps 20 --init nowhere"),
+    ("--embed-dim 8", "--embed-dim 16 --init policy"),
 ]
 
 

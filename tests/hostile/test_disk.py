@@ -119,6 +119,7 @@ MAKERS = {
     **{name: long.line.partition(" --out ")[0] + " --out {}" for name, long in LONG.items()},
     "bench": "bench --json {}",
     "evaluate": "evaluate result --json {}",
+    "check": "check result --out {}",
     "plot": "plot result --out {}",
     "release": f"release run {WORLD} --out {{}}",
     "reproduce": f"reproduce figure8 {WORLD} --only 5 --out {{}}",

@@ -7,6 +7,7 @@ some 200 kills more than those of every test run.
 
 from __future__ import annotations
 
+import shutil
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from .commands import LONG, Reference
+from .commands import LONG, PRETRAIN, Long, Reference, contents
 from .processes import Server, Trap
 
 KILLED = -signal.SIGKILL
@@ -70,3 +71,25 @@ def test_a_killed_command_ends_in_the_same_bits(
     assert done.code == 0, done.err
     assert "error:" not in done.err
     reference.check(here, long)
+
+
+ON = Long(f"{PRETRAIN.line} --init policy", "run")
+
+
+def test_a_killed_training_that_starts_from_a_policy_ends_in_the_same_bits(
+    server: Server, reference: Reference, here: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """It is killed while it copies the policy and later on, and then the policy is replaced."""
+    undisturbed, count = reference.furnish(tmp_path_factory.mktemp("undisturbed")), here / "count"
+    assert server.run(ON.line, undisturbed, count=str(count)).code == 0
+    operations, copying = int(count.read_text()), 0
+    for at in (*range(2, 14, 3), operations // 2):
+        assert server.run(ON.resumed, here, Trap(at)).code == KILLED
+        copying += (here / "run/init").exists() and not (here / "run/config.json").exists()
+    assert copying > 0
+    shutil.rmtree(here / "policy")
+    shutil.copytree(undisturbed / "run/policy", here / "policy")
+    done = server.again(ON.resumed, here)
+    assert done.code == 0, done.err
+    assert contents(here / "run") == contents(undisturbed / "run")
+    assert not list((here / "run").rglob(".writing*"))

@@ -38,6 +38,8 @@ PLACES: tuple[tuple[str, str, Any], ...] = (
     ("mgpo_jax.training", "Trainer.step", begin),
     ("mgpo_jax.runner", "_lay_out", begin),
     ("experiments.evaluation", "evaluate", begin),
+    ("experiments.checking", "officials_of", lambda cases: ()),  # mazes have no official program
+    ("experiments.checking", "compare", begin),
     ("experiments.drawing", "write", begin),
     ("experiments.drawing", "draw_run", begin),
     ("experiments.measurements", "measurements", begin),
