@@ -21,6 +21,7 @@ from envs.errors import DataError, UsageError, nearest, printable, shown
 if TYPE_CHECKING:
     from envs.base import Demonstrator, Environment
     from envs.drawing import Pictures
+    from envs.official import Official
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,7 @@ class World:
       policy_of: the world whose released policy and test tasks this one uses [its own].
       judged: how policies are judged here; every table follows it.
       num_test_tasks: how many tasks are kept for test.
+      official: the program by others that this world re-implements, to compare it with; None: there is none.
     """
 
     name: str
@@ -82,6 +84,7 @@ class World:
     policy_of: str | None = None
     judged: Judgement = field(default_factory=Judgement)
     num_test_tasks: int = 50
+    official: Callable[[Any], Official] | None = None
 
     @property
     def home(self) -> str:

@@ -42,6 +42,9 @@ class Wrapper(Environment):
     def solvable(self, task: Task) -> Bool[Array, ""]:
         return self.env.solvable(task)
 
+    def num_parts(self, task: Task) -> Int[Array, ""]:
+        return self.env.num_parts(task)
+
     def fingerprint(self, task: Task) -> Int[Array, "F"]:
         return self.env.fingerprint(task)
 
@@ -67,32 +70,47 @@ class NoisyState(NamedTuple):
 
 @dataclass(frozen=True)
 class Noisy(Wrapper):
-    """A world behind Gaussian noise on what the agent sees or does (paper, Table 3).
+    """A world behind noise on what the agent sees or does (paper, Table 3).
 
     Attributes:
-      obs_noise: standard deviation of the noise on every component of an observation, in its units.
+      obs_noise: standard deviation of Gaussian noise on every component of an observation, in its units.
       action_noise: standard deviation of the noise on continuous actions, which are clipped to [-1, 1]
         again; a discrete action is replaced by a random one with this probability.
+      obs_range: half widths of uniform noise on each component of an observation, in their units and in
+        the order of the flattened observation; empty for none.
     """
 
     obs_noise: float = 0.0
     action_noise: float = 0.0
+    obs_range: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if not all(0 <= size < math.inf for size in (self.obs_noise, self.action_noise)):
+        sizes = (self.obs_noise, self.action_noise, *self.obs_range)
+        if not all(0 <= size < math.inf for size in sizes):
             raise ValueError(
                 f"noise must be finite and not negative, found {self.obs_noise} on observations and "
-                f"{self.action_noise} on actions"
+                f"{self.action_noise} on actions{self._range_told()}"
+            )
+        if len(self.obs_range) not in (0, self.env.spec.obs.size):
+            raise ValueError(
+                f"uniform noise needs a half width for each component of an observation, of which "
+                f"{self.env.spec.name} has {self.env.spec.obs.size}, found {len(self.obs_range)}"
             )
         if self.env.spec.discrete and self.action_noise > 1:
             raise ValueError(
                 f"noise on discrete actions is a probability, found {self.action_noise}"
             )
-        if self.obs_noise and not self.env.spec.obs.is_float:
+        if (self.obs_noise or any(self.obs_range)) and not self.env.spec.obs.is_float:
             raise ValueError(
                 f"noise on observations needs floating-point observations, those of "
                 f"{self.env.spec.name} are {self.env.spec.obs}"
             )
+
+    def _range_told(self) -> str:
+        """The widths of uniform noise in a message."""
+        if not self.obs_range:
+            return ""
+        return f", uniform within {min(self.obs_range)} to {max(self.obs_range)} on observations"
 
     @property
     def spec(self) -> EnvSpec:
@@ -119,6 +137,9 @@ class Noisy(Wrapper):
     def _blur(self, key: PRNGKeyArray, timestep: TimeStep) -> TimeStep:
         if not self.env.spec.obs.is_float:
             return timestep
-        noise = self.obs_noise * jax.random.normal(key, timestep.obs.shape)
-        noise = noise.astype(timestep.obs.dtype)
-        return timestep._replace(obs=timestep.obs + noise)
+        shape, dtype = timestep.obs.shape, timestep.obs.dtype
+        noise = self.obs_noise * jax.random.normal(key, shape)
+        if self.obs_range:
+            draw = jax.random.uniform(jax.random.fold_in(key, 1), shape, minval=-1.0)
+            noise += jnp.asarray(self.obs_range).reshape(shape) * draw
+        return timestep._replace(obs=timestep.obs + noise.astype(dtype))

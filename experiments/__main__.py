@@ -13,6 +13,7 @@ COMMANDS = {
     "pretrain": "pre-train a policy",
     "adapt": "adapt a policy to unseen tasks",
     "evaluate": "evaluate optimized prompts once more, under noise or in another world",
+    "check": "compare a world with its official program, under optimized prompts",
     "table": "compare adaptations in one table",
     "plot": "draw figures of adaptations",
     "reproduce": "make an ablation of the paper",

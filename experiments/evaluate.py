@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, Literal, NoReturn
 
 import tyro
 
@@ -24,8 +24,9 @@ class EvaluateConfig(Common):
     """Result folders of adaptations."""
     env: Name | None = None
     """Evaluate in another world that has the same tasks (default: where the prompts were found)."""
-    obs_noise: tuple[NotNegative, ...] = ()
-    """Standard deviations of noise on observations, in their units; a row for each."""
+    obs_noise: tuple[NotNegative | Literal["official"], ...] = ()
+    """Standard deviations of noise on observations, in their units, or ``official``: the noise that the
+    world's official program adds by default. A row for each."""
     action_noise: tuple[NotNegative, ...] = ()
     """Standard deviations of noise on actions; where they are discrete, probabilities of a random one."""
     episodes: NumEpisodes = 10

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 
 import envs
 from envs.base import Environment, Task
 from envs.errors import DataError, UsageError
+from envs.official import Official
 from envs.registry import WORLDS, World
 from envs.wrappers import Noisy
 from experiments.store.layout import TASKS
@@ -24,16 +25,24 @@ from mgpo_jax.prompts import Prompt
 from mgpo_jax.runner import evaluate
 from mgpo_jax.tasks import tasks_from
 
+OFFICIAL: Literal["official"] = "official"
+"""In place of a size: the noise on observations that the world's official program adds by default."""
+
 
 class Noise(NamedTuple):
     """Sizes of the noise on observations and on actions."""
 
-    obs: float = 0.0
+    obs: float | Literal["official"] = 0.0
     action: float = 0.0
 
     def __str__(self) -> str:
         named = {"observations": self.obs, "actions": self.action}
-        return ", ".join(f"{name} {size:g}" for name, size in named.items() if size) or "none"
+        told = (f"{name} {_size_told(size)}" for name, size in named.items() if size)
+        return ", ".join(told) or "none"
+
+
+def _size_told(size: float | str) -> str:
+    return size if isinstance(size, str) else f"{size:g}"
 
 
 class Case(NamedTuple):
@@ -50,7 +59,7 @@ class Case(NamedTuple):
     policy: LoadedPolicy
 
 
-def noises(obs: Sequence[float], action: Sequence[float]) -> list[Noise]:
+def noises(obs: Sequence[float | Literal["official"]], action: Sequence[float]) -> list[Noise]:
     """What to evaluate under: each size by itself, or none."""
     of_obs = [Noise(obs=size) for size in obs]
     return of_obs + [Noise(action=size) for size in action] or [Noise()]
@@ -84,13 +93,55 @@ def open_case(
         if name == result.env:
             raise
         raise UsageError(_no_such_tasks(name, result.env)) from None
+    obs_range = _official_noise(name, env, sizes)
     try:
-        behind = [(noise, Noisy(env, noise.obs, noise.action)) for noise in sizes]
+        behind = [(noise, _behind(noise, env, obs_range)) for noise in sizes]
     except ValueError as error:
         flag = "--action-noise" if any(noise.action for noise in sizes) else "--obs-noise"
         raise UsageError(f"{flag}: {error}; give another size") from None
     loaded = load_policy_of(result, world, policy)
     return Case(folder, result, name, world, behind, tasks, loaded)
+
+
+def find_official(name: str, env: Environment) -> Official:
+    """The official program of a world.
+
+    Raises:
+      UsageError: if it has none, or what that needs is not installed.
+    """
+    make = envs.find(name).official
+    if make is None:
+        having = [world.name for world in WORLDS.usable() if world.official is not None]
+        raise UsageError(
+            f"{name} has no official program; worlds that have one: {', '.join(having) or 'none'}"
+        )
+    try:
+        return make(env)
+    except ImportError as error:
+        raise UsageError(str(error)) from None
+
+
+def _official_noise(name: str, env: Environment, sizes: Sequence[Noise]) -> tuple[float, ...]:
+    """Half widths of the noise that the official program of a world adds, if any of the noises is that.
+
+    Raises:
+      UsageError: if there is no such program, or it adds none.
+    """
+    if not any(noise.obs == OFFICIAL for noise in sizes):
+        return ()
+    official = find_official(name, env)
+    if not official.obs_noise:
+        raise UsageError(
+            f"--obs-noise {OFFICIAL}: {official.name} adds no noise to observations; give a number"
+        )
+    return official.obs_noise
+
+
+def _behind(noise: Noise, env: Environment, obs_range: tuple[float, ...]) -> Noisy:
+    """A world behind a noise; ``obs_range`` is that of its official program."""
+    if isinstance(noise.obs, str):
+        return Noisy(env, action_noise=noise.action, obs_range=obs_range)
+    return Noisy(env, noise.obs, noise.action)
 
 
 def _no_such_tasks(name: str, where: str) -> str:

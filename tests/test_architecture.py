@@ -331,6 +331,7 @@ def test_help_and_usage_errors_need_no_jax() -> None:
         "pretrain --preset papr": "did you mean 'paper'?",
         "bench --env maze51": "did you mean 'maze15'?",
         "evaluate": "no result folder given",
+        "check": "no result folder given",
         "plot": "no result folder given",
         "table": "no result folder given",
         "reproduce tabel5": "did you mean 'table5'?",

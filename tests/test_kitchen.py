@@ -113,6 +113,7 @@ class TestRules:
             state, timestep = wait(state)
             assert not timestep.goal_reached or timestep.terminated
         np.testing.assert_allclose(rewards, [1 / 3] * 3, rtol=1e-6)
+        assert WORLD.num_parts(state.task) == 3
         assert timestep.terminated
 
     def test_a_later_one_too_early_ends_all_reward(self):
@@ -393,9 +394,9 @@ class TestNative:
 def kitchen():
     """FrankaKitchen of gymnasium-robotics."""
     pytest.importorskip("gymnasium_robotics")
-    from envs.kitchen.fidelity import gymnasium_kitchen
+    from envs.kitchen.official import franka_kitchen
 
-    return gymnasium_kitchen()
+    return franka_kitchen(HORIZON).unwrapped
 
 
 class TestOracle:

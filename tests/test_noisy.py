@@ -86,6 +86,25 @@ def test_observation_noise():
     assert abs(np.corrcoef(rows.T) - np.eye(6)).max() < 0.1
 
 
+def test_uniform_noise_has_a_width_for_each_component():
+    widths = (0.1, 0.0, 2.0)
+    first, after = steps(Noisy(Echo(), obs_range=widths), jnp.array([0.5, 0.0, -0.9]))
+    noise = np.concatenate([first, after - np.float32([0.5, 0.0, -0.9])])
+    for column, width in zip(noise.T, widths, strict=True):
+        if width:
+            assert stats.kstest(column, stats.uniform(-width, 2 * width).cdf).pvalue > 1e-3
+        else:
+            assert (column == 0).all()
+    rows = np.concatenate([first, after], axis=1)[:, [0, 2, 3, 5]]
+    assert abs(np.corrcoef(rows.T) - np.eye(4)).max() < 0.1
+
+
+def test_uniform_noise_comes_on_top_of_gaussian_noise():
+    both, _ = steps(Noisy(Echo(), obs_noise=0.3, obs_range=(1.0,) * 3), jnp.zeros(3))
+    gaussian, _ = steps(Noisy(Echo(), obs_noise=0.3), jnp.zeros(3))
+    assert stats.kstest((both - gaussian).ravel(), stats.uniform(-1, 2).cdf).pvalue > 1e-3
+
+
 def test_action_noise_keeps_actions_in_their_range():
     _, after = steps(Noisy(Echo(), action_noise=0.2), jnp.array([0.0, 1.0, -0.5]))
     assert abs(after).max() <= 1
@@ -107,6 +126,10 @@ def test_refuses_what_is_no_noise():
             Noisy(Echo(), obs_noise=size)
     with pytest.raises(ValueError, match="a probability, found 2"):
         Noisy(MAZE, action_noise=2.0)
+    with pytest.raises(ValueError, match=r"not negative, .* uniform within -1.0 to 2.0 on obs"):
+        Noisy(Echo(), obs_range=(0.0, -1.0, 2.0))
+    with pytest.raises(ValueError, match="of which echo has 3, found 2"):
+        Noisy(Echo(), obs_range=(0.1, 0.1))
 
 
 def test_whole_numbers_take_no_noise():
@@ -123,5 +146,6 @@ def test_whole_numbers_take_no_noise():
     assert after.dtype == np.uint8
     assert (after == [1, 2, 255]).all()
     message = r"those of echo are uint8\[3\]"
-    with pytest.raises(ValueError, match=message):
-        Noisy(Pixels(), obs_noise=0.1)
+    for noise in ({"obs_noise": 0.1}, {"obs_range": (0.0, 0.0, 0.1)}):
+        with pytest.raises(ValueError, match=message):
+            Noisy(Pixels(), **noise)

@@ -1,8 +1,8 @@
 """Franka Kitchen: a robot arm opens doors and turns switches in an order that it is not told.
 
-Four worlds with the same tasks. ``kitchen`` chooses its physics engine by the machine; ``kitchen-mjx`` and
-``kitchen-native`` name the engine and use the policy and the test tasks of ``kitchen``; ``kitchen-stock``
-is the full scene of gymnasium-robotics. Nothing here imports jax or mujoco.
+Four worlds with the same tasks and one policy. ``kitchen`` is a reduced scene and chooses its physics engine
+by the machine; ``kitchen-mjx`` and ``kitchen-native`` name the engine; ``kitchen-stock`` is the full scene of
+gymnasium-robotics. Nothing here imports jax or mujoco.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from envs.base import Demonstrator
     from envs.drawing import Pictures
     from envs.kitchen.env import Kitchen
+    from envs.official import Official
 
 __all__ = [
     "KITCHEN",
@@ -70,6 +71,12 @@ def load_pictures(env: Kitchen) -> Pictures:
     return kitchen_pictures(env)
 
 
+def load_official(env: Kitchen) -> Official:
+    from envs.kitchen.official import kitchen_official
+
+    return kitchen_official(env)
+
+
 KITCHEN = World(
     name="kitchen",
     make=make,
@@ -96,9 +103,11 @@ KITCHEN = World(
             "head": "fixed_gaussian",
         },
         "ablation": {"steps": 1_000, "trajectories": 9_000},
+        "smoke": {"demonstrator": "expert-reduced"},
     },
     pictures=load_pictures,
     num_test_tasks=25,
+    official=load_official,
 )
 
 KITCHEN_MJX = replace(
@@ -122,4 +131,5 @@ KITCHEN_STOCK = replace(
     name="kitchen-stock",
     make=make_stock,
     summary="the kitchen in the full scene of gymnasium-robotics, with all its collisions",
+    policy_of="kitchen",
 )

@@ -1,7 +1,7 @@
 """The packages behind the kitchen: found, complete and of matching versions, or a clear error.
 
 The scene belongs to gymnasium-robotics, which ships it as files; nothing of it is copied here, and its
-Python code is not imported.
+Python code is imported by ``official.py`` alone, to compare with it.
 """
 
 from __future__ import annotations

@@ -23,9 +23,10 @@ from jaxtyping import Array, Float
 from envs.base import Episode
 from envs.episodes import run_episode
 from envs.errors import UsageError
-from envs.kitchen.demonstrators import kitchen_demonstrators
+from envs.kitchen.demonstrators import in_one_scene
 from envs.kitchen.env import POSITIONS, SUBTASKS, VELOCITIES, Kitchen, KitchenTask
 from envs.kitchen.extra import import_mujoco
+from envs.kitchen.official import franka_kitchen
 from envs.kitchen.physics import PhysicsState
 
 ARM, OBJECTS = slice(0, 7), slice(18, 32)
@@ -63,21 +64,6 @@ def jit_for(env: Kitchen) -> Callable[[Callable], Any]:
     return jax.jit(compiler_options=dict(env.engine.compiler_options))
 
 
-def gymnasium_kitchen() -> Any:
-    """FrankaKitchen without noise; one function of gymnasium-robotics 1.4.2 is replaced.
-
-    Its ``robot_get_obs`` compares joint types in a way that mujoco 3.17 answers with an error.
-    """
-    from gymnasium_robotics.envs.franka_kitchen import franka_env
-    from gymnasium_robotics.envs.franka_kitchen.kitchen_env import KitchenEnv
-
-    def robot_get_obs(model: Any, data: Any, joint_names: Any) -> tuple[np.ndarray, np.ndarray]:
-        return data.qpos[:9].copy(), data.qvel[:9].copy()
-
-    franka_env.robot_get_obs = robot_get_obs
-    return KitchenEnv(list(SUBTASKS), object_noise_ratio=0.0, robot_noise_ratio=0.0)
-
-
 class Recording(NamedTuple):
     """What episodes with given actions look like, and what they cost."""
 
@@ -102,7 +88,7 @@ def record(env: Kitchen, actions: Float[np.ndarray, "B T 9"]) -> Recording:
 
 def record_gymnasium(actions: Float[np.ndarray, "B T 9"]) -> Recording:
     """FrankaKitchen."""
-    theirs = gymnasium_kitchen()
+    theirs = franka_kitchen(actions.shape[1])
 
     def play(rows: np.ndarray) -> list[np.ndarray]:
         theirs.reset(seed=0)
@@ -135,7 +121,7 @@ def recordings(config: FidelityConfig) -> dict[str, Recording]:
 
 def demonstrate(env: Kitchen, num: int) -> Episode:
     """Demonstrations of all five subtasks, in as many orders."""
-    expert = kitchen_demonstrators(env)["expert"]
+    expert = in_one_scene(env)
     order = np.random.default_rng(0).permutation(NUM_LONGEST)[np.arange(num) % NUM_LONGEST]
     tasks = jax.vmap(env.task)(jnp.asarray(env.num_tasks - 1 - order))
 
@@ -163,9 +149,9 @@ def step_in_gymnasium(episodes: Episode) -> Iterator[tuple[list[str], list[str],
     Yields, for each episode, what it completed here and there, in order, and the largest difference of a
     position of arm or objects after a step, the last step excepted.
     """
-    franka = gymnasium_kitchen()
-    robot = franka.robot_env
     trajectory = episodes.trajectory
+    franka = franka_kitchen(trajectory.actions.shape[1])
+    robot = franka.unwrapped.robot_env
     for index, completed in enumerate(completions(episodes)):
         length = trajectory.length[index]
         franka.reset(seed=0)

@@ -1,0 +1,168 @@
+"""FrankaKitchen of gymnasium-robotics, which the kitchen re-implements, as gymnasium makes it."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Sequence
+from importlib.metadata import version
+from itertools import takewhile
+from typing import Any
+
+import numpy as np
+
+from envs.kitchen.env import NONE, NUM_ROBOT, SUBTASKS, Kitchen, KitchenTask
+from envs.kitchen.extra import import_mujoco
+from envs.official import Official, Played, played
+
+NAME = "FrankaKitchen-v1"
+
+# Noise that FrankaKitchen adds to each component of an observation by default: uniform within ratio times
+# amplitude (``robot_noise_ratio`` of FrankaRobot, ``object_noise_ratio`` of KitchenEnv; amplitudes of
+# franka_config.xml). Its amplitudes of the objects' positions begin one joint too early, with a finger's.
+ROBOT_RATIO, OBJECT_RATIO = 0.01, 0.0005
+ROBOT_AMPLITUDE = 0.1  # of positions and of velocities, rad and m
+POSITION_AMPLITUDES = np.repeat([0.1, 0.005, 0.0005, 0.005, 0.1, 0.005, 0.1], [1, 2, 6, 3, 3, 3, 3])
+VELOCITY_AMPLITUDES = np.repeat([0.005, 0.1, 0.005, 0.1], [11, 3, 3, 3])
+OBS_NOISE = np.concatenate(
+    [
+        np.full(2 * NUM_ROBOT, ROBOT_RATIO * ROBOT_AMPLITUDE),
+        OBJECT_RATIO * POSITION_AMPLITUDES,
+        OBJECT_RATIO * VELOCITY_AMPLITUDES,
+    ]
+)
+
+
+def franka_kitchen(horizon: int, **changes: Any) -> Any:
+    """A new FrankaKitchen from ``gymnasium.make``, to be compared with the kitchen here.
+
+    Noise is off. All five subtasks are to be completed, since the kitchen here counts those outside of a
+    task as well. Each counts once, at its first arrival, and completing them ends nothing: the task's rule
+    and the horizon do.
+
+    Args:
+      horizon: steps after which an episode is truncated.
+      changes: further settings of FrankaKitchen, or others than these.
+    """
+    import_mujoco()
+    gymnasium = _mended_gymnasium()
+    settings = {
+        "tasks_to_complete": list(SUBTASKS),
+        "remove_task_when_completed": True,
+        "terminate_on_tasks_completed": False,
+        "robot_noise_ratio": 0.0,
+        "object_noise_ratio": 0.0,
+    }
+    # The checker of gymnasium would warn that observations of two steps share the array of the goals.
+    return gymnasium.make(
+        NAME, max_episode_steps=horizon, disable_env_checker=True, **{**settings, **changes}
+    )
+
+
+def _mended_gymnasium() -> Any:
+    """gymnasium with the environments of gymnasium-robotics 1.4.2, mended for mujoco 3.17.
+
+    Its ``robot_get_obs`` asks whether the type of a joint, a number of numpy, is in a tuple of mujoco's
+    names for types. Such a number and its name no longer compare equal, and an assertion fails. What it
+    returns, the positions and velocities of the robot's joints, is read here without asking for types.
+    """
+    with contextlib.redirect_stderr(io.StringIO()):  # a notice about environments that are not used
+        import gymnasium
+        import gymnasium_robotics
+    from gymnasium_robotics.envs.franka_kitchen import franka_env
+
+    def robot_get_obs(
+        model: Any, data: Any, joint_names: Sequence[str]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        joints = [data.joint(name) for name in joint_names if name.startswith("robot")]
+        qpos, qvel = ([getattr(joint, of) for joint in joints] for of in ("qpos", "qvel"))
+        return np.concatenate(qpos), np.concatenate(qvel)
+
+    franka_env.robot_get_obs = robot_get_obs
+    gymnasium.register_envs(gymnasium_robotics)
+    return gymnasium
+
+
+class FrankaEpisode:
+    """An episode of FrankaKitchen on one task.
+
+    What is complete, and when, is what FrankaKitchen says; only the order that the task wants is added.
+
+    Args:
+      task: the order.
+      horizon: steps after which it is truncated.
+      rounded: whether to round its state to float32 after each step, as that of the kitchen here is.
+    """
+
+    def __init__(self, task: KitchenTask, horizon: int, rounded: bool = False) -> None:
+        self._order = subtasks_of(task)
+        self._world = franka_kitchen(horizon)
+        self._rounded = rounded
+
+    def reset(self) -> np.ndarray:
+        observed, _ = self._world.reset(seed=0)
+        self._length = 0
+        self._reached: list[tuple[str, int]] = []
+        return observed["observation"]
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, bool]:
+        observed, _, terminated, truncated, info = self._world.step(np.asarray(action, np.float64))
+        if self._rounded:
+            self._round()
+        self._length += 1
+        new = info["episode_task_completions"][len(self._reached) :]
+        self._reached += [(name, self._length) for name in self._in_turn(new)]
+        return observed["observation"], terminated or truncated or self._solved == len(self._order)
+
+    def _round(self) -> None:
+        """Round everything that the next step depends on."""
+        robot = self._world.unwrapped.robot_env
+        for array in (robot.data.qpos, robot.data.qvel, robot.data.qacc_warmstart):
+            array[:] = array.astype(np.float32)
+        robot._last_robot_qpos = robot.data.qpos[:NUM_ROBOT].copy()  # where actions start from
+
+    def played(self) -> Played:
+        return played(self._reached, self._solved / len(self._order), self._length)
+
+    @property
+    def _solved(self) -> int:
+        return num_in_turn([name for name, _ in self._reached], self._order)
+
+    def _in_turn(self, names: Sequence[str]) -> list[str]:
+        """Subtasks that arrived in one step, which FrankaKitchen lists in no order: the next one first."""
+        expected = self._order[self._solved : self._solved + 1]
+        return sorted(names, key=lambda name: (name not in expected, SUBTASKS.index(name)))
+
+
+def num_in_turn(completed: Sequence[str], order: Sequence[str]) -> int:
+    """How many subtasks of an order were completed in their turn, none of the later ones before them.
+
+    Subtasks outside of the order do not matter.
+    """
+    of_task = [name for name in completed if name in order]
+    in_turn = takewhile(lambda pair: pair[0] == pair[1], zip(of_task, order, strict=False))
+    return sum(1 for _ in in_turn)
+
+
+def subtasks_of(task: KitchenTask) -> list[str]:
+    """The names of the subtasks of a task, in its order."""
+    return [SUBTASKS[index] for index in np.asarray(task.order) if index != NONE]
+
+
+def goal_name(goal: np.ndarray) -> str:
+    """The subtasks of a goal; numbers, where an optimizer has made them up."""
+    if not np.isin(goal, (0, 1)).all():
+        return " ".join(f"{number:.2f}" for number in goal)
+    return " and ".join(SUBTASKS[index] for index in np.flatnonzero(goal))
+
+
+def kitchen_official(env: Kitchen) -> Official:
+    """FrankaKitchen, for the horizon of a kitchen."""
+    return Official(
+        name=f"{NAME} of gymnasium-robotics {version('gymnasium-robotics')}",
+        episode=lambda task: FrankaEpisode(task, env.horizon),
+        control=lambda task: FrankaEpisode(task, env.horizon, rounded=True),
+        goal_name=goal_name,
+        task_name=lambda task: ", ".join(subtasks_of(task)),
+        obs_noise=tuple(OBS_NOISE.tolist()),
+    )
