@@ -72,7 +72,7 @@ class World:
       policy_of: the world whose released policy and test tasks this one uses [its own].
       judged: how policies are judged here; every table follows it.
       num_test_tasks: how many tasks are kept for test.
-      official: the program by others that this world re-implements, to compare it with; None: there is none.
+      official: the program by others that this world re-implements, to compare it with [none].
     """
 
     name: str

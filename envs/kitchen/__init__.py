@@ -1,8 +1,8 @@
 """Franka Kitchen: a robot arm opens doors and turns switches in an order that it is not told.
 
-Four worlds with the same tasks and one policy. ``kitchen`` is a reduced scene and chooses its physics engine
-by the machine; ``kitchen-mjx`` and ``kitchen-native`` name the engine; ``kitchen-stock`` is the full scene of
-gymnasium-robotics. Nothing here imports jax or mujoco.
+Four worlds with the same tasks and one policy. ``kitchen`` is a reduced scene and chooses its physics
+engine by the machine; ``kitchen-mjx`` and ``kitchen-native`` name the engine; ``kitchen-stock`` is the full
+scene of gymnasium-robotics. Nothing here imports jax or mujoco.
 """
 
 from __future__ import annotations

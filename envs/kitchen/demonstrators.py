@@ -178,10 +178,10 @@ def scripted_arm(env: Kitchen, noise: float = NOISE) -> Agent:
 
 
 def kitchen_demonstrators(env: Kitchen) -> dict[str, Demonstrator]:
-    """Those of a kitchen. All go through every ordered task in turn (paper: 300 of them, 30 episodes each).
+    """Those of a kitchen. All go through every ordered task in turn (paper: 300 tasks, 30 episodes each).
 
-    ``expert`` demonstrates in both scenes, with the reduced one's physics drawn for each episode. The others
-    demonstrate in one scene as it is, with one engine. A world that names an engine or the stock scene has
+    ``expert`` demonstrates in both scenes, with the reduced one's physics drawn for each episode. The
+    others demonstrate in one scene as it is, with one engine. A world that names MJX or the stock scene has
     its own one first.
     """
     import_mujoco()  # complains now and not in the middle of a program

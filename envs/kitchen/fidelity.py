@@ -33,8 +33,9 @@ ARM, OBJECTS = slice(0, 7), slice(18, 32)
 NUM_LONGEST = 120  # tasks of all five subtasks, the last in the enumeration
 # Iterations of MJX's contact solver and of its line search.
 SOLVERS = ((1, 4), (2, 4), (4, 6), (8, 10), (16, 16))
-GYMNASIUM, STOCK, REDUCED, MJX = (
-    "gymnasium-robotics", "stock model, C", "reduced model, C", "reduced model, MJX"
+GYMNASIUM, BATCH, STOCK, REDUCED, MJX = (
+    "gymnasium-robotics", "MuJoCo's batch stepper", "stock model, C", "reduced model, C",
+    "reduced model, MJX",
 )  # fmt: skip
 
 
@@ -99,6 +100,27 @@ def record_gymnasium(actions: Float[np.ndarray, "B T 9"]) -> Recording:
     return Recording(obs=obs, rate=actions[..., 0].size / (time.process_time() - start))
 
 
+def record_batch(actions: Float[np.ndarray, "B T 9"]) -> Recording:
+    """MuJoCo's own batch stepper on the full scene, without any world around it."""
+    from mujoco.batch import Batch
+
+    from envs.kitchen.env import MAX_SHIFT, NUM_ROBOT, TARGET_HIGH, TARGET_LOW
+    from envs.kitchen.model import INITIAL_POSITIONS, SUBSTEPS, full_model
+    from envs.kitchen.native import num_threads
+
+    batch = Batch(full_model(), len(actions), num_threads(len(actions)))
+    qpos, qvel, ctrl = (batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
+    qpos[:] = INITIAL_POSITIONS
+    obs = np.zeros((*actions.shape[:2], len(POSITIONS) + len(VELOCITIES)), np.float32)
+    start = time.process_time()
+    for step in range(actions.shape[1]):
+        shift = MAX_SHIFT * np.clip(actions[:, step], -1, 1)
+        ctrl[:] = np.clip(qpos[:, :NUM_ROBOT] + shift, TARGET_LOW, TARGET_HIGH)
+        batch.step(nstep=SUBSTEPS["stock"])
+        obs[:, step, POSITIONS], obs[:, step, VELOCITIES] = qpos, qvel
+    return Recording(obs=obs, rate=actions[..., 0].size / (time.process_time() - start))
+
+
 def random_actions(num_worlds: int, num_steps: int) -> Float[np.ndarray, "B T 9"]:
     """Uniform in the cube, held for five steps each: the arm gets around."""
     rng = np.random.default_rng(0)
@@ -111,6 +133,7 @@ def recordings(config: FidelityConfig) -> dict[str, Recording]:
     actions = random_actions(config.worlds, config.steps)
     found = {
         GYMNASIUM: record_gymnasium(actions),
+        BATCH: record_batch(actions),
         STOCK: record(kitchen("native", "stock", config.steps), actions),
         REDUCED: record(kitchen("native", horizon=config.steps), actions),
     }
@@ -237,7 +260,7 @@ def report_random_actions(config: FidelityConfig) -> None:
     times = [step for step in (1, 5, 10, 20, 40, 80) if step <= config.steps]
     print("\nmedian and largest difference of positions (rad, m) after so many steps")
     print(f"{'':<52}" + "".join(f"{step:>18}" for step in times))
-    for first, second in ((STOCK, GYMNASIUM), (REDUCED, STOCK), (MJX, REDUCED)):
+    for first, second in ((STOCK, GYMNASIUM), (STOCK, BATCH), (REDUCED, STOCK), (MJX, REDUCED)):
         if first not in found:
             continue
         errors = np.abs(found[first].obs - found[second].obs)

@@ -22,6 +22,12 @@ from envs.kitchen.physics import Physics, PhysicsState
 WORLDS_PER_THREAD = 8  # with fewer, waking the thread takes longer than the work it does
 
 
+def num_threads(num_worlds: int) -> int:
+    """How many threads step so many worlds fastest here."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return min(cores or 1, -(-num_worlds // WORLDS_PER_THREAD))
+
+
 class Stepper:
     """Steps any number of worlds of one model; callers may be on several threads.
 
@@ -93,9 +99,7 @@ class Stepper:
         with self._lock:
             if self._idle[num]:
                 return self._idle[num].pop()
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        threads = min(cores or 1, -(-num // WORLDS_PER_THREAD))
-        return Batch(self.model, num, threads)
+        return Batch(self.model, num, num_threads(num))
 
     def _give_back(self, batch: Batch) -> None:
         with self._lock:
