@@ -63,9 +63,6 @@ class Official:
     Attributes:
       name: what it is called, with its version.
       episode: an episode of it on a task of the world, with the return that the task's rule gives.
-      control: an episode of it whose numbers are rounded as they are in the world here, and nothing else is
-        changed. Where it ends elsewhere than ``episode``, no other program can be expected to agree. None:
-        there is no such.
       goal_name: a goal ``[G]`` in words, the same ones for both programs.
       task_name: a task in words.
       obs_noise: half widths of the uniform noise that it adds by default to each component of an
@@ -76,7 +73,6 @@ class Official:
     episode: Callable[[Task], ByHand]
     goal_name: Callable[[np.ndarray], str]
     task_name: Callable[[Task], str]
-    control: Callable[[Task], ByHand] | None = None
     obs_noise: tuple[float, ...] = ()
 
 

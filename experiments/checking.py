@@ -1,8 +1,6 @@
 """Optimized prompts in a world and in its official program: what the policy reaches in both.
 
-Two episodes agree when they reach the same goals in the same order. Where the world is on the way is left
-aside: in contact, the smallest difference of two simulations grows. How much of a disagreement is of this
-kind is told by the control, the official program with its numbers rounded.
+Two episodes agree when they reach the same goals in the same order.
 """
 
 from __future__ import annotations
@@ -53,7 +51,6 @@ def _compare_prompt(case: Case, official: Official, seed: int, index: int) -> di
     actor = Actor(case.policy, goals)
     own = play(actor, Own(envs.make(case.env), task, official.goal_name))
     theirs = play(actor, official.episode(task))
-    control = play(actor, official.control(task)) if official.control else None
     return {
         "folder": str(case.folder),
         "env": case.env,
@@ -66,10 +63,8 @@ def _compare_prompt(case: Case, official: Official, seed: int, index: int) -> di
         "adapted": float(result.eval_returns[seed, index, -1]),
         "here": _entries(own),
         "there": _entries(theirs),
-        "control": control and _entries(control),
         "agrees": own.reached == theirs.reached,
         "same_return": abs(own.return_ - theirs.return_) < SAME_RETURN,
-        "control_agrees": control and control.reached == theirs.reached,
     }
 
 
@@ -89,7 +84,6 @@ def summaries(cases: Sequence[Case], rows: Sequence[dict[str, Any]]) -> list[dic
     found = []
     for folder, case in by_folder.items():
         own = [row for row in rows if row["folder"] == folder]
-        controls = [row["control_agrees"] for row in own]
         if own:
             found.append(
                 {
@@ -99,7 +93,6 @@ def summaries(cases: Sequence[Case], rows: Sequence[dict[str, Any]]) -> list[dic
                     "num_prompts": len(own),
                     "num_agreeing": sum(row["agrees"] for row in own),
                     "num_same_return": sum(row["same_return"] for row in own),
-                    "num_control_agreeing": None if None in controls else sum(controls),
                     "adapted": float(np.mean([row["adapted"] for row in own])),
                     "return": float(np.mean([row["here"]["return"] for row in own])),
                     "official_return": float(np.mean([row["there"]["return"] for row in own])),
@@ -132,11 +125,9 @@ def cells(row: dict[str, Any]) -> list[str]:
 
 def told(summary: dict[str, Any]) -> str:
     """A summary in words."""
-    num, control = summary["num_prompts"], summary["num_control_agreeing"]
-    itself = "" if control is None else f" (with itself, rounded: {control})"
+    num = summary["num_prompts"]
     return (
         f"{summary['folder']}: {summary['num_agreeing']} of {num} prompts reach the same goals in the same "
-        f"order{itself}, {summary['num_same_return']} have the same return; mean return "
-        f"{summary['return']:.3f} in {summary['env']}, {summary['official_return']:.3f} in "
-        f"{summary['official']}"
+        f"order, {summary['num_same_return']} have the same return; mean return {summary['return']:.3f} in "
+        f"{summary['env']}, {summary['official_return']:.3f} in {summary['official']}"
     )

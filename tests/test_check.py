@@ -37,7 +37,6 @@ def official_of(horizon: int) -> Official:
     return Official(
         name="mazes 1.0",
         episode=lambda task: Own(other, task, cell),
-        control=lambda task: Own(other, task, cell),
         goal_name=cell,
         task_name=lambda task: f"to {np.asarray(task.goal).tolist()}",
         obs_noise=WIDTHS,
@@ -90,30 +89,27 @@ def test_a_world_agrees_with_itself(result: Path, capsys: pytest.CaptureFixture[
         (1, 1),
     ]
     for row in written["rows"]:
-        assert row["here"] == row["there"] == row["control"]
-        assert row["control_agrees"]
+        assert row["here"] == row["there"]
         assert row["agrees"]
         assert row["prompt"] == ["cell 3 3", "cell 1 5" if row["task"] == 0 else "cell 5 1"]
         assert row["here"]["steps"] == list(range(1, row["here"]["length"] + 1))
     (summary,) = written["summaries"]
-    counted = ("prompts", "agreeing", "same_return", "control_agreeing")
-    assert [summary[f"num_{name}"] for name in counted] == [4, 4, 4, 4]
+    counted = ("prompts", "agreeing", "same_return")
+    assert [summary[f"num_{name}"] for name in counted] == [4, 4, 4]
     assert summary["return"] == summary["official_return"]
     assert summary["adapted"] == pytest.approx(-0.25)  # made by hand, not by this policy
     assert summary["results_sha256"] == hash_file(result / "results.npz")
     assert summary["policy_sha256"] == hash_file(result.with_name("policy") / "weights.npz")
     assert {"command", "revision", "versions", "devices"} <= written.keys()
-    said = "4 of 4 prompts reach the same goals in the same order (with itself, rounded: 4), 4 have"
-    assert said in text
+    assert "4 of 4 prompts reach the same goals in the same order, 4 have the same return" in text
     assert text.count("the same |") == 4
     assert "to [1, 5]" in text
 
 
 def test_a_difference_is_shown(result: Path, register: Any, capsys: Any) -> None:
-    register(lambda env: replace(official_of(horizon=3), control=None))
+    register(lambda env: official_of(horizon=3))
     written, text = checked(result, capsys)
     for row in written["rows"]:
-        assert (row["control"], row["control_agrees"]) == (None, None)
         assert not row["agrees"]
         assert not row["same_return"]
         assert (row["here"]["length"], row["there"]["length"]) == (6, 3)

@@ -118,4 +118,4 @@ class TestExpert:
 
     def test_by_name(self):
         known = envs.find("kitchen").demonstrators(WORLD)
-        assert list(known) == ["expert"]
+        assert list(known) == ["expert", "expert-reduced", "expert-stock", "expert-mjx"]

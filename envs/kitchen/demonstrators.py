@@ -26,8 +26,6 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from envs.base import Agent, Demonstrator, Episode, Task, TimeStep, Trajectory
 from envs.kitchen.arm import Arm, Pose, arm_pose, make_arm, rotation_vector, turn
 from envs.kitchen.env import (
-    MAX_SHIFT,
-    NUM_ROBOT,
     NUM_SUBTASKS,
     Kitchen,
     KitchenState,
@@ -35,7 +33,7 @@ from envs.kitchen.env import (
 )
 from envs.kitchen.extra import import_mujoco
 from envs.kitchen.phases import RETRY, Phase, Plan, make_plan
-from envs.kitchen.physics import CONTROL_PERIOD, MODELS
+from envs.kitchen.physics import CONTROL_PERIOD, MAX_SHIFT, MODELS, NUM_ROBOT
 
 NUM_JOINTS = 7
 NOISE = 0.08  # standard deviation on the actions of arm and fingers

@@ -26,7 +26,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from envs.base import ArraySpec, Box, Engine, Environment, EnvSpec, State, Task, TimeStep
 from envs.kitchen.engines import BACKENDS, load_physics, resolve_backend
-from envs.kitchen.physics import CONTROL_PERIOD, MODELS, Physics
+from envs.kitchen.physics import MODELS, NUM_ROBOT, Physics
 
 SUBTASKS = ("bottom burner", "light switch", "slide cabinet", "hinge cabinet", "microwave")
 NUM_SUBTASKS = len(SUBTASKS)
@@ -42,14 +42,10 @@ TARGETS = (
     {22: -0.75},
 )
 THRESHOLD = 0.3
-NUM_POSITIONS, NUM_ROBOT, OBS_DIM = 30, 9, 59
+NUM_POSITIONS, OBS_DIM = 30, 59
 # Where they are in an observation: positions and velocities of the robot, then of the objects.
 POSITIONS, VELOCITIES = np.r_[:9, 18:39], np.r_[9:18, 39:59]
 
-MAX_SHIFT = 2.0 * CONTROL_PERIOD  # action scale times control period (FrankaRobot: act_rng, dt)
-# Bounds of the position targets (franka_config.xml), rad and m.
-TARGET_LOW = (-2.9, -1.8, -2.9, -3.1, -2.9, 0.0, -2.9, 0.0, 0.0)
-TARGET_HIGH = (2.9, 1.8, 2.9, 0.0, 2.9, 3.8, 2.9, 0.04, 0.04)
 # Up to jax 0.10 the fusion emitters of XLA's CPU backend make MJX's batched graph hundreds of times slower.
 # Since 0.11 they cannot be switched off, and the graph is half as fast as without them.
 MJX_ON_CPU = (("xla_cpu_use_fusion_emitters", False),) if jax.__version_info__ < (0, 11) else ()
@@ -72,7 +68,7 @@ class KitchenState(NamedTuple):
     task: Task
     """A ``KitchenTask``, or another task with an ``order``."""
     physics: State
-    """A ``PhysicsState``, or what else has positions ``qpos`` and velocities ``qvel``."""
+    """That of the engine, with positions ``qpos`` and velocities ``qvel``."""
     completed: Bool[Array, "S"]
     """Subtasks that have been completed at least once."""
     newly: Bool[Array, "S"]
@@ -214,8 +210,8 @@ class Kitchen(Environment):
 
     def step(self, state: KitchenState, action: Float[Array, "9"]) -> tuple[KitchenState, TimeStep]:
         valid = jnp.all(jnp.isfinite(action))
-        ctrl = self.control(state.physics, jnp.where(valid, action, 0.0))
-        physics = self.physics.advance(state.physics, ctrl, valid & ~state.done)
+        sound = jnp.where(valid, action, 0.0)
+        physics = self.physics.advance(state.physics, sound, valid & ~state.done)
         failed = ~valid | ~_is_sane(physics)
         physics = jax.tree.map(lambda old, new: jnp.where(failed, old, new), state.physics, physics)
 
@@ -246,12 +242,6 @@ class Kitchen(Environment):
         after = jax.tree.map(lambda old, new: jnp.where(state.done, old, new), state, after)
         reward = jnp.where(in_order & ~state.done, 1.0 / num_subtasks, 0.0)
         return after, self._observe(after, reward, after.num_solved >= num_subtasks)
-
-    def control(self, physics: State, action: Float[Array, "9"]) -> Float[Array, "9"]:
-        """Position targets of the actuators: an action moves them from where the joints are."""
-        shift = MAX_SHIFT * jnp.clip(action, -1.0, 1.0)
-        targets = physics.qpos[:NUM_ROBOT] + shift
-        return jnp.clip(targets, jnp.array(TARGET_LOW), jnp.array(TARGET_HIGH))
 
     def _at_target(self, physics: State) -> Bool[Array, "S"]:
         """Which subtasks' joints are within the threshold of their targets."""

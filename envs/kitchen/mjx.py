@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from envs.kitchen.model import SUBSTEPS, initial_state, load_model, scene_coordinates
-from envs.kitchen.physics import Physics, PhysicsState
+from envs.kitchen.physics import Physics, PhysicsState, position_targets
 
 with redirect_stdout(io.StringIO()):  # it prints that Warp, which is not used here, is missing
     from mujoco import mjx
@@ -36,9 +36,10 @@ def mjx_physics(
         blank = mjx.make_data(model)
 
     def advance(
-        state: PhysicsState, ctrl: Float[Array, "9"], active: Bool[Array, ""]
+        state: PhysicsState, action: Float[Array, "9"], active: Bool[Array, ""]
     ) -> PhysicsState:
         del active  # it would save no time, as a batch computes all its worlds in any case
+        ctrl = position_targets(state.qpos, action)
 
         def substep(state: PhysicsState, _: None) -> tuple[PhysicsState, None]:
             qpos, qvel, warmstart = state

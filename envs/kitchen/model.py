@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
 from envs.kitchen.extra import check_extra, scene_path
 from envs.kitchen.physics import CONTROL_PERIOD, Coordinates, PhysicsState
@@ -112,11 +113,15 @@ def load_model(name: str) -> mujoco.MjModel:
     return model
 
 
+def initial_positions(name: str) -> Float[np.ndarray, "Q"]:
+    """Where every episode starts."""
+    return INITIAL_POSITIONS[joint_addresses(name)[0]]
+
+
 def initial_state(name: str) -> PhysicsState:
     """Where every episode starts, at rest."""
-    model = load_model(name)
-    positions: Any = INITIAL_POSITIONS[joint_addresses(name)[0]].astype(np.float32)
-    rest: Any = np.zeros(model.nv, np.float32)
+    positions: Any = initial_positions(name).astype(np.float32)
+    rest: Any = np.zeros(load_model(name).nv, np.float32)
     return PhysicsState(qpos=positions, qvel=rest, warmstart=rest)
 
 

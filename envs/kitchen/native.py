@@ -13,11 +13,17 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Shaped
 from mujoco.batch import Batch, SimulationError
 
-from envs.kitchen.model import SUBSTEPS, initial_state, load_model, scene_coordinates
-from envs.kitchen.physics import Physics, PhysicsState
+from envs.kitchen.model import (
+    SUBSTEPS,
+    initial_positions,
+    initial_state,
+    load_model,
+    scene_coordinates,
+)
+from envs.kitchen.physics import ExactState, Physics, PhysicsState, position_targets
 
 WORLDS_PER_THREAD = 8  # with fewer, waking the thread takes longer than the work it does
 
@@ -58,7 +64,7 @@ class Stepper:
         # waits for the callback.
         flat = np.asarray(rows).reshape(-1, rows.shape[-1])
         after = self.step(flat[:, :width], flat[:, width:-1], flat[:, -1] > 0)
-        return after.reshape(*rows.shape[:-1], width)
+        return after.astype(np.float32).reshape(*rows.shape[:-1], width)
 
     def step(
         self,
@@ -67,7 +73,7 @@ class Stepper:
         active: Bool[np.ndarray, "B"],
         values: Mapping[str, np.ndarray] | None = None,
     ) -> Float[np.ndarray, "B N"]:
-        """The states of B worlds after a control step; those that are not active stay as they are.
+        """The states of B worlds after a control step, float64; those not active stay as they are.
 
         Args:
           before: positions, velocities and warm starts.
@@ -89,7 +95,7 @@ class Stepper:
                 batch.step(ids=active, nstep=self.num_substeps)
         except SimulationError as error:
             failed = np.asarray(error.ids)
-        after = np.concatenate(views, axis=1).astype(np.float32)
+        after = np.concatenate(views, axis=1)
         after[failed] = np.nan
         after[~active] = before[~active]
         self._give_back(batch)
@@ -106,6 +112,28 @@ class Stepper:
             self._idle[batch.nsim].append(batch)
 
 
+class ExactStepper:
+    """Steps worlds whose states are in double precision, as MuJoCo and FrankaKitchen have them."""
+
+    def __init__(self, stepper: Stepper) -> None:
+        self.stepper = stepper
+        self.sizes = (2 * sum(stepper.sizes), stepper.sizes[0], stepper.sizes[1])
+
+    def __call__(self, rows: Array | np.ndarray) -> np.ndarray:
+        """New states ``[..., 2 N + Q + V]`` of rows ``[..., 2 N + 9 + 1]``, all as integers of 32 bits.
+
+        A row holds the N = Q + 2 V numbers of a state in float64, the action in float32 and whether to
+        step at all. A new state also has its positions and velocities in float32.
+        """
+        flat, num = np.asarray(rows).reshape(-1, rows.shape[-1]), self.sizes[0]
+        before = np.ascontiguousarray(flat[:, :num]).view(np.float64)
+        action = np.ascontiguousarray(flat[:, num:-1]).view(np.float32).astype(np.float64)
+        after = self.stepper.step(before, position_targets(before, action), flat[:, -1] > 0)
+        seen = after[:, : sum(self.sizes[1:])].astype(np.float32)
+        bits = np.concatenate([after.view(np.int32), seen.view(np.int32)], axis=1)
+        return bits.reshape(*rows.shape[:-1], sum(self.sizes))
+
+
 def silence_warnings() -> None:
     """Let diverged worlds be flagged in their states alone; MuJoCo would also write a log to the folder."""
     if mujoco.get_mju_user_warning() is None:
@@ -113,13 +141,14 @@ def silence_warnings() -> None:
 
 
 def in_programs(
-    stepper: Callable[[Array | np.ndarray], np.ndarray], width: int
-) -> Callable[[Float[Array, "N"]], Float[Array, "M"]]:
+    stepper: Callable[[Array | np.ndarray], np.ndarray], width: int, dtype: Any = jnp.float32
+) -> Callable[[Shaped[Array, "N"]], Shaped[Array, "M"]]:
     """A function of numpy arrays ``[..., N] -> [..., M]`` for one row, to be used in jitted programs.
 
     Args:
       stepper: the function.
       width: M.
+      dtype: of what it returns.
     """
 
     # For CPU devices: a pure_callback copies large arguments on the threads of the device. These may all be
@@ -128,8 +157,8 @@ def in_programs(
         del context
         np.asarray(out)[...] = stepper(np.asarray(rows))
 
-    def call(row: Float[Array, "N"]) -> Float[Array, "M"]:
-        result = jax.ShapeDtypeStruct((width,), jnp.float32)
+    def call(row: Shaped[Array, "N"]) -> Shaped[Array, "M"]:
+        result = jax.ShapeDtypeStruct((width,), dtype)
         if jax.default_backend() == "cpu":
             return buffer_callback(write, result, vmap_method="expand_dims")(row)
         return jax.pure_callback(stepper, result, row, vmap_method="expand_dims")
@@ -138,19 +167,49 @@ def in_programs(
 
 
 def native_physics(name: str) -> Physics:
-    """The C engine with the model ``reduced`` or ``stock``."""
+    """The C engine with the model ``reduced``, or with ``stock``, whose states are exact."""
     silence_warnings()
     stepper = Stepper(load_model(name), SUBSTEPS[name])
+    if name == "stock":
+        return _exact_physics(name, ExactStepper(stepper))
     splits = tuple(np.cumsum(stepper.sizes)[:-1].tolist())
     call = in_programs(stepper, sum(stepper.sizes))
 
     def advance(
-        state: PhysicsState, ctrl: Float[Array, "9"], active: Bool[Array, ""]
+        state: PhysicsState, action: Float[Array, "9"], active: Bool[Array, ""]
     ) -> PhysicsState:
+        ctrl = position_targets(state.qpos, action)
         after = call(jnp.concatenate([*state, ctrl, active[None].astype(jnp.float32)]))
         return PhysicsState._make(jnp.split(after, splits))
 
     positions, velocities = scene_coordinates(name)
     return Physics(
         initial=initial_state(name), positions=positions, velocities=velocities, advance=advance
+    )
+
+
+def _exact_physics(name: str, stepper: ExactStepper) -> Physics:
+    """The C engine with states in double precision."""
+    splits = tuple(np.cumsum(stepper.sizes)[:-1].tolist())
+    call = in_programs(stepper, sum(stepper.sizes), jnp.int32)
+
+    def advance(
+        state: ExactState, action: Float[Array, "9"], active: Bool[Array, ""]
+    ) -> ExactState:
+        bits = jax.lax.bitcast_convert_type(action, jnp.int32)
+        after = call(jnp.concatenate([state.exact, bits, active[None].astype(jnp.int32)]))
+        exact, *seen = jnp.split(after, splits)
+        qpos, qvel = (jax.lax.bitcast_convert_type(part, jnp.float32) for part in seen)
+        return ExactState(qpos=qpos, qvel=qvel, exact=exact)
+
+    rounded, positions = initial_state(name), initial_positions(name)
+    at_rest = np.zeros(sum(stepper.stepper.sizes))
+    at_rest[: len(positions)] = positions
+    coordinates, velocities = scene_coordinates(name)
+    exact: Any = at_rest.view(np.int32)
+    return Physics(
+        initial=ExactState(qpos=rounded.qpos, qvel=rounded.qvel, exact=exact),
+        positions=coordinates,
+        velocities=velocities,
+        advance=advance,
     )

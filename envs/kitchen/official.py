@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from envs.kitchen.env import NONE, NUM_ROBOT, SUBTASKS, Kitchen, KitchenTask
+from envs.kitchen.env import NONE, SUBTASKS, Kitchen, KitchenTask
 from envs.kitchen.extra import import_mujoco
+from envs.kitchen.physics import NUM_ROBOT
 from envs.official import Official, Played, played
 
 NAME = "FrankaKitchen-v1"
@@ -91,13 +92,11 @@ class FrankaEpisode:
     Args:
       task: the order.
       horizon: steps after which it is truncated.
-      rounded: whether to round its state to float32 after each step, as that of the kitchen here is.
     """
 
-    def __init__(self, task: KitchenTask, horizon: int, rounded: bool = False) -> None:
+    def __init__(self, task: KitchenTask, horizon: int) -> None:
         self._order = subtasks_of(task)
         self._world = franka_kitchen(horizon)
-        self._rounded = rounded
 
     def reset(self) -> np.ndarray:
         observed, _ = self._world.reset(seed=0)
@@ -107,19 +106,10 @@ class FrankaEpisode:
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, bool]:
         observed, _, terminated, truncated, info = self._world.step(np.asarray(action, np.float64))
-        if self._rounded:
-            self._round()
         self._length += 1
         new = info["episode_task_completions"][len(self._reached) :]
         self._reached += [(name, self._length) for name in self._in_turn(new)]
         return observed["observation"], terminated or truncated or self._solved == len(self._order)
-
-    def _round(self) -> None:
-        """Round everything that the next step depends on."""
-        robot = self._world.unwrapped.robot_env
-        for array in (robot.data.qpos, robot.data.qvel, robot.data.qacc_warmstart):
-            array[:] = array.astype(np.float32)
-        robot._last_robot_qpos = robot.data.qpos[:NUM_ROBOT].copy()  # where actions start from
 
     def played(self) -> Played:
         return played(self._reached, self._solved / len(self._order), self._length)
@@ -161,7 +151,6 @@ def kitchen_official(env: Kitchen) -> Official:
     return Official(
         name=f"{NAME} of gymnasium-robotics {version('gymnasium-robotics')}",
         episode=lambda task: FrankaEpisode(task, env.horizon),
-        control=lambda task: FrankaEpisode(task, env.horizon, rounded=True),
         goal_name=goal_name,
         task_name=lambda task: ", ".join(subtasks_of(task)),
         obs_noise=tuple(OBS_NOISE.tolist()),

@@ -33,7 +33,7 @@ from envs.kitchen.model import (
     scene_coordinates,
 )
 from envs.kitchen.native import Stepper, in_programs, silence_warnings
-from envs.kitchen.physics import MODELS, Either, Physics
+from envs.kitchen.physics import MODELS, Either, Physics, position_targets
 
 # Half widths of the uniform distributions of what is drawn in the reduced scene.
 FRICTION = 0.3  # of the factor on the sliding friction of all contacts
@@ -253,6 +253,7 @@ class VariedStepper:
         own = [part[:, place] for part, place in zip(parts, places, strict=True)]
         fields = varied_fields(self._models[name], variation) if stepper.fields else {}
         own_after = stepper.step(np.concatenate(own, axis=1), ctrl, active, fields)
+        own_after = own_after.astype(np.float32)
         qpos, qvel, own_warmstart = np.split(own_after, np.cumsum(stepper.sizes)[:-1], axis=1)
         positions, velocities = self._coordinates[name]
         warmstart = np.zeros_like(parts[2])
@@ -269,8 +270,9 @@ def varied_physics() -> Physics:
     call = in_programs(stepper, sum(stepper.sizes))
 
     def advance(
-        state: VariedState, ctrl: Float[Array, "9"], active: Bool[Array, ""]
+        state: VariedState, action: Float[Array, "9"], active: Bool[Array, ""]
     ) -> VariedState:
+        ctrl = position_targets(state.qpos, action)
         after = call(jnp.concatenate([*state, ctrl, active[None].astype(jnp.float32)]))
         return VariedState(*jnp.split(after, splits), variation=state.variation)
 

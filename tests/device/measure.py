@@ -165,7 +165,7 @@ def physics_of(num: int) -> Figures:
 
     @jax.vmap
     def advance(state: PhysicsState, action: jax.Array) -> PhysicsState:
-        return engine.advance(state, env.control(state, action), jnp.ones((), bool))
+        return engine.advance(state, action, jnp.ones((), bool))
 
     def play(state: PhysicsState, rows: jax.Array) -> PhysicsState:
         return jax.lax.scan(lambda state, row: (advance(state, row), None), state, rows)[0]
