@@ -96,7 +96,7 @@ def record_gymnasium(actions: Float[np.ndarray, "B T 9"]) -> Recording:
         return [theirs.step(action)[0]["observation"] for action in rows]
 
     start = time.process_time()
-    obs = np.array([play(rows) for rows in actions])
+    obs = np.array([play(rows) for rows in actions], np.float32)
     return Recording(obs=obs, rate=actions[..., 0].size / (time.process_time() - start))
 
 
