@@ -278,7 +278,7 @@ def test_records(name):
     assert world.summary
     known = world.demonstrators(world.make())
     assert all(isinstance(one, envs.Demonstrator) for one in known.values())
-    assert {"fast", "paper"} <= set(world.presets) <= {"fast", "paper", "ablation"}
+    assert {"fast", "paper"} <= set(world.presets) <= {"fast", "paper", "smoke", "ablation"}
     for settings in world.presets.values():
         assert settings["steps"] > 0
         assert settings["trajectories"] > 0
