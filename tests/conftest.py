@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import os
+from collections.abc import Iterator
+from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # Two devices, so that what is spread over devices is tested as such.
@@ -39,6 +42,19 @@ def require_kitchen() -> None:
         import_mujoco()
     except ImportError as error:
         pytest.skip(str(error), allow_module_level=True)
+
+
+MOST_MAPPINGS = 15_000  # of a process's memory; Linux ends a program that wants more than 65,530
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _few_programs() -> Iterator[None]:
+    """Forget compiled programs between modules when there are many: each maps memory of its own."""
+    yield
+    mappings = Path("/proc/self/maps")
+    if mappings.exists() and mappings.read_bytes().count(b"\n") > MOST_MAPPINGS:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture
