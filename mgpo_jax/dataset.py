@@ -178,6 +178,23 @@ def load_dataset(
     return dataset, document
 
 
+def variant_counts(folder: Path, sha256: str) -> dict[str, int]:
+    """How many trajectories of each variant of its world a dataset holds, by the variant's name.
+
+    Args:
+      folder: where the dataset was; it may be gone by now.
+      sha256: the hash of its arrays. Another dataset in that folder says nothing.
+
+    Raises:
+      DataError: if the manifest is damaged.
+    """
+    path = Path(folder) / MANIFEST
+    if not path.is_file():
+        return {}
+    _, manifest = _read_manifest(path, {}, f"remove {folder} and collect it again")
+    return manifest.variants if manifest.sha256 == sha256 else {}
+
+
 def _read_manifest(
     path: Path, made: Mapping[str, Any], mend: str
 ) -> tuple[dict[str, Any], _Manifest]:

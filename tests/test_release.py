@@ -105,11 +105,45 @@ def test_the_card_names_the_policy_that_a_training_began_from(run: Path, release
     assert row in card.read_text().splitlines()
 
 
-def configured(**changes: Any) -> Callable[[Path], Any]:
-    """Change entries of ``made`` in the config of the run's policy."""
+def test_the_card_tells_how_that_policy_was_trained(run: Path, release: Release) -> None:
+    shutil.copytree(run / "policy", run / "init")
+    configured("init", config=CONTINUED, init_sha256="0b" * 32)(run)
+    configured(config=CONTINUED, init_sha256="0a" * 32)(run)
+    assert release()[0] == 0
+    before = PretrainConfig(env="gridworld")
+    row = (
+        f"| which had seen | {before.train.steps:,} steps of {before.train.batch_size} trajectories, "
+        f"{before.data.trajectories:,} demonstrations, seed 0; began from "
+        f"the weights of the policy the/first\\n, SHA-256 {'0b' * 32} |"
+    )
+    assert row in (run.with_name("packed") / "README.md").read_text().splitlines()
+
+
+@pytest.mark.parametrize(
+    ("sha256", "text"),
+    [("0c" * 32, "seed 0 (6,798 in stock, 2 in reduced) |"), ("0d" * 32, "seed 0 |")],
+)
+def test_the_card_counts_the_variants_of_the_dataset(
+    run: Path, release: Release, sha256: str, text: str
+) -> None:
+    """A manifest that is of other data by now says nothing."""
+    data = run.with_name("data")
+    data.mkdir()
+    manifest = {"format": 2, "sha256": "0c" * 32, "variants": {"stock": 6798, "reduced": 2}}
+    (data / "manifest.json").write_text(json.dumps(manifest))
+    meta = {"dataset": str(data), "dataset_sha256": sha256}
+    (run / "meta.json").write_text(json.dumps(meta))
+    assert release()[0] == 0
+    row = (run.with_name("packed") / "README.md").read_text().splitlines()[6]
+    assert row.startswith("| data | ")
+    assert row.endswith(text)
+
+
+def configured(folder: str = "policy", **changes: Any) -> Callable[[Path], Any]:
+    """Change entries of ``made`` in the config of a policy of the run."""
 
     def damage(run: Path) -> None:
-        path = run / "policy" / "config.json"
+        path = run / folder / "config.json"
         document = json.loads(path.read_text())
         document["made"] = {**document["made"], **changes}
         path.write_text(json.dumps(document))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +16,8 @@ from experiments.datasets import find_demonstrator
 from experiments.figures import training_curve
 from experiments.store.metrics import METRICS, RESUME, read_metrics
 from experiments.store.provenance import read_meta
-from experiments.store.settings import PretrainConfig, pretraining_from
+from experiments.store.settings import INIT, PretrainConfig, pretraining_from
+from mgpo_jax.dataset import variant_counts
 from mgpo_jax.files import new_folder, write_text
 from mgpo_jax.policy import LoadedPolicy, check_fits
 from mgpo_jax.policy_files import CONFIG, WEIGHTS, read_policy
@@ -31,7 +32,7 @@ CARD = """# Multi-goal Transformer for {env}
 | --- | --- |
 | network | {num_layers} layers, width {embed_dim}, {num_heads} head(s), {num_weights:,} weights |
 | prompts | up to {max_prompt_length} goals, {order} |
-| data | {trajectories:,} demonstrations of {demonstrator}, seed {data_seed} |{begun}
+| data | {trajectories:,} demonstrations of {demonstrator}, seed {data_seed}{variants} |{begun}
 | training | {steps:,} steps of {batch_size} trajectories, {optimizer}, {cpu_minutes:.0f} CPU-minutes |
 | validation loss | {val_loss:.4f} nats an action, {correct} {val_accuracy:.4f} |
 | greedy return of the prompt (g^M) | {initial:.3f} on {eval_tasks} tasks of the training's own |
@@ -63,6 +64,8 @@ class Finished(NamedTuple):
     rows: list[dict[str, Any]]
     """Its metrics."""
     command: str
+    variants: dict[str, int]
+    """How many trajectories of its dataset are of each variant of the world (empty: not known)."""
 
     @property
     def released(self) -> Path:
@@ -99,7 +102,9 @@ def read_run(source: Path, env: str | None = None) -> Finished:
         )
     rows = read_metrics(source / METRICS, METRICS_SHOWN)
     meta = read_meta(source / "meta.json", RESUME)
-    return Finished(source, world, policy, config, rows, " ".join(meta.command) or "(not known)")
+    variants = variant_counts(Path(meta.dataset), meta.dataset_sha256) if meta.dataset else {}
+    command = " ".join(meta.command) or "(not known)"
+    return Finished(source, world, policy, config, rows, command, variants)
 
 
 def cpu_minutes(rows: Sequence[dict[str, Any]]) -> float:
@@ -125,6 +130,7 @@ def card(run: Finished) -> str:
         trajectories=settings.data.trajectories,
         demonstrator=find_demonstrator(run.world, env, settings.data.demonstrator)[0],
         data_seed=settings.data.data_seed,
+        variants=_variants(run),
         begun=_begun(run),
         steps=last["step"],
         batch_size=settings.train.batch_size,
@@ -140,12 +146,40 @@ def card(run: Finished) -> str:
     )
 
 
+def _variants(run: Finished) -> str:
+    """What a card says of the variants of the world in a dataset."""
+    counts = [f"{count:,} in {printable(name)}" for name, count in run.variants.items()]
+    return f" ({', '.join(counts)})" if counts else ""
+
+
 def _begun(run: Finished) -> str:
-    """The row of a card that says which policy a training began from; empty for random weights."""
+    """The rows of a card that say which policy a training began from; empty for random weights.
+
+    The second row tells how that policy was trained, which its copy in the run knows.
+    """
     if run.settings.init is None:
         return ""
-    place, sha256 = printable(str(run.settings.init)), run.policy.made["init_sha256"]
-    return f"\n| began from | the weights of the policy {place}, SHA-256 {sha256} |"
+    row = f"\n| began from | {_origin(run.settings.init, run.policy.made)} |"
+    folder = run.source / INIT
+    if not (folder / CONFIG).is_file():
+        return row
+    made = read_policy(folder).made
+    if not isinstance(made.get("config"), dict):
+        return row
+    before = pretraining_from(made["config"], folder / CONFIG)
+    text = (
+        f"{before.train.steps:,} steps of {before.train.batch_size} trajectories, "
+        f"{before.data.trajectories:,} demonstrations, seed {before.data.data_seed}"
+    )
+    if before.init is not None:
+        text += f"; began from {_origin(before.init, made)}"
+    return f"{row}\n| which had seen | {text} |"
+
+
+def _origin(place: Path, made: Mapping[str, Any]) -> str:
+    """The policy that a training began from, in words."""
+    sha256 = printable(str(made.get("init_sha256", "(not known)")))
+    return f"the weights of the policy {printable(str(place))}, SHA-256 {sha256}"
 
 
 def release(run: Finished, folder: Path) -> None:

@@ -35,6 +35,9 @@ class Meta(BaseModel):
     revision: str = ""
     versions: dict[str, str] = {}
     devices: list[str] = []
+    dataset: Place | None = None
+    """The folder of the dataset of a training."""
+    dataset_sha256: str = ""
     policy_places: Annotated[list[Place], MaxLen(8)] = []
     """Where the policy of an adaptation lies: relative to its folder, and absolute."""
 
