@@ -60,7 +60,7 @@ def test_reached_goals_are_those_of_the_replayed_episodes(name):
 
 
 def test_results_of_the_first_format_are_read():
-    results = load_results(RESULTS / "kitchen" / "ucb")
+    results = load_results(RESULTS / "ablations" / "kitchen" / "mixture" / "ucb")
     assert results.method == "ucb"
     assert results.actions is None
     assert results.reached is None
