@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from envs.base import Demonstrator, Environment
     from envs.drawing import Pictures
     from envs.official import Official
+    from envs.page import Page
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,7 @@ class World:
         ``paper``, ``smoke``): names and values of settings of ``experiments.pretrain``. ``ablation`` has
         the steps and trajectories of the trainings of ``experiments.reproduce``.
       pictures: what the world draws; None draws learning curves only.
+      page: what the world brings to HTML pages; None shows what needs nothing of it.
       policy_of: the world whose released policy and test tasks this one uses [its own].
       judged: how policies are judged here; every table follows it.
       num_test_tasks: how many tasks are kept for test.
@@ -81,6 +83,7 @@ class World:
     demonstrators: Callable[[Any], Mapping[str, Demonstrator]] = _no_demonstrators
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     pictures: Callable[[Any], Pictures] | None = None
+    page: Callable[[Any], Page] | None = None
     policy_of: str | None = None
     judged: Judgement = field(default_factory=Judgement)
     num_test_tasks: int = 50

@@ -61,6 +61,9 @@ def main(config: AdaptConfig) -> None:
         from experiments.drawing import draw_run
 
         draw_run(world, results, folder)
+        from experiments.pages.report import report_of_run
+
+        report_of_run(folder)
     print(f"results in {folder}", file=sys.stderr)
 
 

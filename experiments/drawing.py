@@ -51,14 +51,20 @@ def draw_run(world: World, results: Results, folder: Path) -> None:
         pictures = world.pictures(envs.make(results.env))
         drawn += figures_of_run(pictures, results, results.most_improved())
     for name, save in drawn:
-        if is_foreign(folder / name):
-            print(
-                f"{printable(str(folder / name))} is kept: it was changed, or not written by this command; "
-                "move it away to draw it anew",
-                file=sys.stderr,
-            )
-        else:
+        if not is_kept(folder / name):
             write(folder / name, save)
+
+
+def is_kept(path: Path) -> bool:
+    """Whether a file stays since no command wrote it as it is, which a line on stderr then says."""
+    if not is_foreign(path):
+        return False
+    print(
+        f"{printable(str(path))} is kept: it was changed, or not written by this command; move it away to "
+        "draw it anew",
+        file=sys.stderr,
+    )
+    return True
 
 
 def pictures_together(

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from envs.base import Demonstrator
     from envs.drawing import Pictures
     from envs.gridworld.env import GridWorld
+    from envs.page import Page
 
 __all__ = ["GRIDWORLD"]
 
@@ -33,6 +34,12 @@ def load_pictures(env: GridWorld) -> Pictures:
     return grid_pictures(env)
 
 
+def load_page(env: GridWorld) -> Page:
+    from envs.gridworld.page import grid_page
+
+    return grid_page(env)
+
+
 GRIDWORLD = World(
     name="gridworld",
     make=make,
@@ -44,6 +51,7 @@ GRIDWORLD = World(
         "paper": {"steps": 50_000, "trajectories": 13_600, "max_prompt_length": 8, "bucket": 8},
     },
     pictures=load_pictures,
+    page=load_page,
     # Episodes start on a random cell, so one return says little about a prompt.
     judged=Judgement(mode="greedy", episodes=10),
 )

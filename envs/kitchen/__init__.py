@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from envs.drawing import Pictures
     from envs.kitchen.env import Kitchen
     from envs.official import Official
+    from envs.page import Page
 
 __all__ = [
     "KITCHEN",
@@ -71,6 +72,12 @@ def load_pictures(env: Kitchen) -> Pictures:
     return kitchen_pictures(env)
 
 
+def load_page(env: Kitchen) -> Page:
+    from envs.kitchen.page import kitchen_page
+
+    return kitchen_page(env)
+
+
 def load_official(env: Kitchen) -> Official:
     from envs.kitchen.official import kitchen_official
 
@@ -106,6 +113,7 @@ KITCHEN = World(
         "smoke": {"demonstrator": "expert-reduced"},
     },
     pictures=load_pictures,
+    page=load_page,
     num_test_tasks=25,
     official=load_official,
 )

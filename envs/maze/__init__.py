@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from envs.base import Demonstrator
     from envs.drawing import Pictures
     from envs.maze.env import MazeRunner
+    from envs.page import Page
 
 __all__ = ["MAZE15", "MAZE30"]
 
@@ -40,6 +41,12 @@ def load_pictures(env: MazeRunner) -> Pictures:
     return maze_pictures(env)
 
 
+def load_page(env: MazeRunner) -> Page:
+    from envs.maze.page import maze_page
+
+    return maze_page(env)
+
+
 MAZE15 = World(
     name="maze15",
     make=make15,
@@ -52,6 +59,7 @@ MAZE15 = World(
         "ablation": {"steps": 2_000, "trajectories": 10_000},
     },
     pictures=load_pictures,
+    page=load_page,
 )
 
 MAZE30 = World(
@@ -72,4 +80,5 @@ MAZE30 = World(
         "ablation": {"steps": 1_000, "trajectories": 10_000},
     },
     pictures=load_pictures,
+    page=load_page,
 )

@@ -23,7 +23,7 @@ def _note(content: bytes) -> bytes:
     return (_LABEL + hashlib.sha256(content).hexdigest()).encode()
 
 
-def _markdown(content: bytes) -> tuple[bytes, bytes]:
+def _comment(content: bytes) -> tuple[bytes, bytes]:
     return b"\n<!-- " + _note(content) + b" -->\n", b""
 
 
@@ -41,7 +41,8 @@ def _gif(content: bytes) -> tuple[bytes, bytes]:
 
 
 _SEALS: dict[str, Callable[[bytes], tuple[bytes, bytes]]] = {
-    ".md": _markdown,
+    ".md": _comment,
+    ".html": _comment,
     ".png": _png,
     ".gif": _gif,
 }

@@ -144,7 +144,10 @@ ON = f"{PRETRAIN} --init policy".replace("--embed-dim 8 --num-layers 1 ", "")
 RESUME_ON = f"{ON} --out begun --resume"
 PLOT = "result --out new"
 CHECK = "result --out new.json"
+REPORT = "result --out new.html"
+PLAYGROUND = "--policy policy --out new.html"
 OF_DATASET = ("trajectories.npz", "was collected by")
+OF_SUMMARY = ("summary.json",)
 OF_POLICY = ("weights.npz", "policy is not", "policy of", "no finished policy")
 DATASET = "data/maze15/astar4-40-seed0"
 FILES = (
@@ -164,6 +167,13 @@ FILES = (
     FileKind("plot", PLOT, "result", "tasks.npz", MAZES, 2, ("policy",)),
     FileKind("plot", PLOT, "result", "config.json", RESULT_CONFIG, 3, ("policy",), ("weights",)),
     FileKind("plot", PLOT, "result", "summary.json", NOTHING, 1, ("policy",)),
+    FileKind("report", REPORT, "result", "results.npz", RESULT_ARRAYS, 3, (), OF_SUMMARY),
+    FileKind("report", REPORT, "result", "tasks.npz", MAZES, 2),
+    FileKind("report", REPORT, "result", "config.json", RESULT_CONFIG, 2, (), OF_SUMMARY),
+    FileKind("report", REPORT, "result", "summary.json", SUMMARY, 2),
+    FileKind("report", REPORT, "result", "meta.json", NOTHING, 1),
+    FileKind("playground", PLAYGROUND, "policy", "config.json", POLICY, 2, (), OF_POLICY),
+    FileKind("playground", PLAYGROUND, "policy", "weights.npz", WEIGHTS, 1),
     FileKind("table", "result", "result", "summary.json", SUMMARY, 6),
     FileKind("table", "result", "result", "config.json", NOTHING, 2),
     FileKind("table", "result", "result", "results.npz", NpzTraits(checked=()), 1),

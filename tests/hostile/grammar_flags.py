@@ -49,13 +49,17 @@ BASE: dict[str, tuple[str, tuple[str, ...]]] = {
     "check": ("result --out new.json", ("result", "policy")),
     "table": ("result", ("result",)),
     "plot": ("result --out new", ("result", "policy")),
+    "report": ("result --out new.html", ("result",)),
+    "playground": ("--policy policy --out new.html", ("policy",)),
     "reproduce": ("table4 --seeds 1 --out new", ()),
     "release": ("run --out new", ("run",)),
     "bench": ("--quick --json new.json", ()),
 }
 """A sound command line for each command, and the sound material in the current folder that it needs."""
 
-MAY_WRITE = ("new", "new.json", "runs", "data", "figures")
+MAY_WRITE = (
+    "new", "new.json", "new.html", "report.html", "playground.html", "runs", "data", "figures",
+)  # fmt: skip
 """Where commands may write that are not refused."""
 
 CONTRADICTIONS: dict[str, tuple[tuple[str, str], ...]] = {
@@ -105,6 +109,19 @@ CONTRADICTIONS: dict[str, tuple[tuple[str, str], ...]] = {
         ("--tasks 0 99", "--tasks"),
         ("nowhere", "nowhere"),
     ),
+    "report": (
+        ("nowhere", "nowhere"),
+        ("policy", "policy"),
+        ("result nowhere", "nowhere"),
+        ("--out new.json", "--out"),
+        ("--out nowhere/new.html", "nowhere"),
+    ),
+    "playground": (
+        ("--env gridworld", "policy"),
+        ("--env maze15 maze30", "--policy"),
+        ("--policy result", "result"),
+        ("--out new.txt", "--out"),
+    ),
     "reproduce": (
         ("--only nothing", "only"),
         ("table5 --only nothing", "nothing"),
@@ -146,6 +163,8 @@ VALID: dict[str, tuple[str, ...]] = {
     "check": ("--env maze15",),
     "table": ("result", "result/"),
     "plot": ("--tasks 0", "--tasks 1 0", "--seed 0"),
+    "report": ("result result/", "--env maze15"),
+    "playground": ("--env=maze15", "--env maze15 maze15", "--env envs.maze:MAZE15"),
     "reproduce": ("table5 --only astar4", "--seeds 2", "figure8 --only 5 10"),
     "bench": ("--demonstrator astar4", "--trajectories 3"),
 }

@@ -121,6 +121,8 @@ MAKERS = {
     "evaluate": "evaluate result --json {}",
     "check": "check result --out {}",
     "plot": "plot result --out {}",
+    "report": f"report result {WORLD} --out {{}}",
+    "playground": "playground --out {}",
     "release": f"release run {WORLD} --out {{}}",
     "reproduce": f"reproduce figure8 {WORLD} --only 5 --out {{}}",
 }

@@ -42,6 +42,8 @@ PLACES: tuple[tuple[str, str, Any], ...] = (
     ("experiments.checking", "compare", begin),
     ("experiments.drawing", "write", begin),
     ("experiments.drawing", "draw_run", begin),
+    ("experiments.pages.report", "_knowledge", begin),
+    ("experiments.pages.playground", "half_weights", begin),
     ("experiments.measurements", "measurements", begin),
 )
 """Module, name in it, and what stands there instead."""

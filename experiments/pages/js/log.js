@@ -1,0 +1,123 @@
+// One adaptation as experiments/pages/report.py packed it.
+
+import { mean, product, range, unpack } from "./arrays.js";
+
+/**
+ * @typedef {import("./arrays.js").Packed} Packed
+ * @typedef {{ label: string, color: string, facts: [string, string][], comparison: string, note: string, arrays: Packed }} RunData
+ * @typedef {{ goals: Goal[], pulls: number, mean: number, isNew: boolean, isChanged: boolean }} ArmRow
+ */
+
+/** What an adaptation did: axes S seeds, N tasks, E episodes, R rounds, C judgements. */
+export class Log {
+  /** @param {RunData} data @param {Record<string, import("./arrays.js").Shaped>} arrays */
+  constructor(data, arrays) {
+    this.data = data;
+    this.arrays = arrays;
+    const [numSeeds, numTasks, numEpisodes] = arrays.returns.shape;
+    this.numSeeds = numSeeds;
+    this.numTasks = numTasks;
+    this.numEpisodes = numEpisodes;
+    this.numJudged = arrays.evalEpisodes.shape[0];
+    this.hasPrompts = Boolean(arrays.choice);
+    this.hasArms = Boolean(arrays.arm);
+    this.hasActions = Boolean(arrays.actions);
+    if (this.hasPrompts) arrays.choice.data = decodeNew(arrays.choice.data);
+    this.hasReached = Boolean(arrays.reachedCounts);
+    this.actionsFrom = this.hasActions ? sums(arrays.lengths.data) : new Uint32Array(0);
+    this.reachedFrom = this.hasReached ? sums(arrays.reachedCounts.data) : new Uint32Array(0);
+  }
+
+  /** @param {RunData} data */
+  static async of(data) {
+    return new Log(data, await unpack(data.arrays));
+  }
+
+  /** @param {number} seed @param {number} task @param {number} episode */
+  at(seed, task, episode) {
+    return (seed * this.numTasks + task) * this.numEpisodes + episode;
+  }
+
+  /** Return of an episode of the search. @param {number} seed @param {number} task @param {number} episode @returns {number} */
+  return_(seed, task, episode) {
+    return this.arrays.returns.data[this.at(seed, task, episode)];
+  }
+
+  /** @param {number} seed @param {number} task @param {number} judgement @returns {number} */
+  judged(seed, task, judgement) {
+    return this.arrays.evalReturns.data[(seed * this.numTasks + task) * this.numJudged + judgement];
+  }
+
+  /** Mean judged return of a task over the seeds. @param {number} task @param {number} judgement */
+  judgedMean(task, judgement) {
+    return mean(range(this.numSeeds).map((seed) => this.judged(seed, task, judgement)));
+  }
+
+  /** The goals of row `index` of the table of prompts. @param {number} index @returns {Goal[]} */
+  prompt(index) {
+    const { prompts, goals } = this.arrays, slots = prompts.shape[1], size = goals.shape[1];
+    const places = Array.from(prompts.data.slice(index * slots, (index + 1) * slots), (place) => place - 1);
+    return places.filter((place) => place >= 0).map((place) => goals.data.slice(place * size, (place + 1) * size));
+  }
+
+  /** @param {"choice" | "best" | "greedy"} name @param {number} seed @param {number} task @param {number} episode @returns {number} */
+  ofRound(name, seed, task, episode) {
+    const rounds = this.arrays[name].shape[2];
+    const round = Math.floor((episode * rounds) / this.numEpisodes);
+    return this.arrays[name].data[(seed * this.numTasks + task) * rounds + round];
+  }
+
+  /** The actions of an episode. @param {number} seed @param {number} task @param {number} episode @returns {ArrayLike<number>} */
+  actions(seed, task, episode) {
+    const at = this.at(seed, task, episode);
+    return this.arrays.actions.data.subarray(this.actionsFrom[at], this.actionsFrom[at + 1]);
+  }
+
+  /** What the rules need to begin an episode. @param {number} seed @param {number} task @param {number} episode @returns {ArrayLike<number> | null} */
+  start(seed, task, episode) {
+    const starts = this.arrays.starts;
+    if (!starts) return null;
+    const size = product(starts.shape.slice(3)), at = this.at(seed, task, episode) * size;
+    return starts.data.subarray(at, at + size);
+  }
+
+  /** Goals that an episode reached, with their steps. @param {number} seed @param {number} task @param {number} episode @returns {{ step: number, goal: Goal }[]} */
+  reached(seed, task, episode) {
+    const at = this.at(seed, task, episode), { reachedSteps, reachedGoals, goals } = this.arrays, size = goals.shape[1];
+    return range(this.reachedFrom[at + 1] - this.reachedFrom[at]).map((i) => {
+      const place = this.reachedFrom[at] + i, goal = reachedGoals.data[place];
+      return { step: reachedSteps.data[place] + 1, goal: goals.data.slice(goal * size, (goal + 1) * size) };
+    });
+  }
+
+  /** The table of arms after an episode. @param {number} seed @param {number} task @param {number} episode @returns {ArmRow[]} */
+  arms(seed, task, episode) {
+    /** @type {{ goals: Goal[], returns: number[], since: number }[]} */
+    const rows = [];
+    let changed = -1;
+    for (let e = 0; e <= episode; e++) {
+      const at = this.at(seed, task, e), row = this.arrays.arm.data[at];
+      changed = row === 255 ? -1 : row;
+      if (changed < 0) continue;
+      if (this.arrays.pulls.data[at] === 1)
+        rows[row] = { goals: this.prompt(this.ofRound("choice", seed, task, e)), returns: [], since: e };
+      rows[row].returns.push(this.return_(seed, task, e));
+    }
+    return rows.map(({ goals, returns, since }, row) => ({
+      goals, pulls: returns.length, mean: mean(returns), isNew: since === episode, isChanged: row === changed,
+    }));
+  }
+}
+
+/** Numbers of prompts, of which each new one was written as 0. @type {(coded: ArrayLike<number>) => Uint32Array} */
+function decodeNew(coded) {
+  let numKnown = 0;
+  return Uint32Array.from(coded, (code) => (code ? code - 1 : numKnown++));
+}
+
+/** Where the parts begin that have these sizes; the last entry is the end. @type {(sizes: ArrayLike<number>) => Uint32Array} */
+function sums(sizes) {
+  const from = new Uint32Array(sizes.length + 1);
+  for (let i = 0; i < sizes.length; i++) from[i + 1] = from[i] + sizes[i];
+  return from;
+}

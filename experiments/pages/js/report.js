@@ -1,0 +1,376 @@
+// The report: what was run, curves, all tasks, and a viewer that steps through every episode.
+
+import { mean, range } from "./arrays.js";
+import { chartWidth, curves, scale, ticks } from "./chart.js";
+import { byId, drawScene, element, fill, legendOf, onScheme, svg } from "./dom.js";
+import { Log } from "./log.js";
+
+/**
+ * @typedef {{ name: string, summary: string, facts: any, parts: string[] }} WorldData
+ * @typedef {{ world: WorldData, tasks: { task: any, text: string }[], optimum: number[] | null, withEpisodes: boolean,
+ *   runs: import("./log.js").RunData[] }} ReportData
+ * @typedef {{ run: number, task: number, seed: number, episode: number }} Place episode counts from 0
+ */
+
+const SOLVED = 1e-4; // a smaller regret counts as an optimal solution
+const PLAY_MS = 450;
+
+/** Names for goals: the world's, those of its parts, or its numbers. @type {(world: WorldPage | null, data: WorldData) => (goal: Goal) => string} */
+function goalNamer(world, { facts, parts }) {
+  if (world) return (goal) => world.goalName(facts, goal);
+  if (parts.length)
+    return (goal) => Array.from(goal).flatMap((value, i) => (value > 0.5 ? [parts[i] ?? String(i)] : [])).join(" + ") || "none";
+  return (goal) => `(${Array.from(goal, (value) => Number(value.toFixed(2))).join(", ")})`;
+}
+
+/** The goals of a prompt, numbered. @param {HTMLElement} parent @param {Goal[]} goals @param {(goal: Goal) => string} name */
+function showPrompt(parent, goals, name) {
+  fill(parent, ...goals.map((goal, i) =>
+    element("span", { class: i === goals.length - 1 ? "chip last" : "chip" }, element("b", {}, String(i + 1)), name(goal))));
+}
+
+/** A table of facts, one column for each run. @param {Log[]} logs */
+function factsTable(logs) {
+  const names = logs[0].data.facts.map(([name]) => name);
+  const rows = names.map((name, i) => ({ name, values: logs.map((log) => log.data.facts[i][1]) }));
+  const head = logs.map(({ data }) => {
+    const swatch = element("span", { class: "swatch" });
+    swatch.style.background = data.color;
+    return element("th", { scope: "col" }, swatch, data.label);
+  });
+  return element("table", { class: "facts" },
+    element("thead", {}, element("tr", {}, element("td", {}), ...head)),
+    element("tbody", {}, ...rows.filter(({ values }) => values.some(Boolean)).map(({ name, values }) =>
+      element("tr", {}, element("th", { scope: "row" }, name), ...values.map((value) => element("td", {}, value || "-"))))));
+}
+
+/** Mean over tasks and seeds of the judged returns, with the spread over seeds. @param {Log} log @param {number} index */
+function seriesOf(log, index) {
+  const points = range(log.numJudged).map((c) => {
+    const ofSeeds = range(log.numSeeds).map((seed) => mean(range(log.numTasks).map((task) => log.judged(seed, task, c))));
+    const y = mean(ofSeeds), std = Math.sqrt(mean(ofSeeds.map((value) => (value - y) ** 2)));
+    const x = log.arrays.evalEpisodes.data[c];
+    return log.numSeeds > 1 ? { x, y, low: y - std, high: y + std } : { x, y };
+  });
+  return { label: log.data.label, color: log.data.color, dash: ["", "7 4", "2 3"][index % 3] || undefined, points };
+}
+
+class Report {
+  /** @param {WorldPage | null} world @param {ReportData} data @param {Log[]} logs */
+  constructor(world, data, logs) {
+    this.world = world;
+    this.data = data;
+    this.logs = logs;
+    this.goalName = goalNamer(world, data.world);
+    /** @type {Place} */
+    this.place = { run: 0, task: 0, seed: 0, episode: logs[0].numEpisodes - 1 };
+    this.timer = 0;
+    /** @type {Map<number, any[]>} */
+    this.walks = new Map();
+  }
+
+  get log() {
+    return this.logs[this.place.run];
+  }
+
+  get canDraw() {
+    return Boolean(this.world) && this.log.hasActions;
+  }
+
+  begin() {
+    const { data, logs } = this;
+    document.title = `${data.world.name}: ${logs.map((log) => log.data.label).join(", ")}`;
+    byId("title").textContent = `Adaptation to ${data.tasks.length} tasks of ${data.world.name}`;
+    byId("summary").textContent = data.world.summary;
+    fill(byId("head"), factsTable(logs));
+    fill(byId("comparisons"), ...logs.slice(1).map((log) =>
+      element("p", {}, `${log.data.label} minus ${logs[0].data.label}, paired by task, with 95 % intervals over seeds: ${log.data.comparison}.`)));
+    this.drawCurves();
+    this.prepareTasks();
+    this.prepareViewer();
+    this.go(this.fromAddress());
+    window.addEventListener("hashchange", () => this.go(this.fromAddress()));
+    window.addEventListener("resize", () => this.draw());
+    onScheme(() => this.redraw());
+  }
+
+  redraw() {
+    this.drawThumbnails();
+    this.draw();
+  }
+
+  drawCurves() {
+    const { data, logs } = this;
+    const lines = data.optimum ? [{ label: "optimum", y: mean(data.optimum) }] : [];
+    fill(byId("curves"), curves({
+      title: "Mean return over tasks and seeds of the best prompt after each number of episodes",
+      xLabel: "episode", series: logs.map(seriesOf), lines,
+    }));
+    fill(byId("curves-legend"), ...logs.map((log, i) => {
+      const line = svg("svg", { width: 34, height: 10, "aria-hidden": "true" },
+        svg("line", { x1: 0, x2: 30, y1: 5, y2: 5, stroke: log.data.color, "stroke-width": 3, "stroke-dasharray": ["", "7 4", "2 3"][i % 3] || null }));
+      return element("span", { class: "entry" }, line, log.data.label);
+    }), element("span", { class: "entry" }, "bands: standard deviation over seeds"));
+  }
+
+  /** What tasks can be sorted by. @returns {[string, (task: number) => number][]} */
+  orders() {
+    const { data, logs } = this, log = this.log;
+    /** @type {[string, (task: number) => number][]} */
+    const orders = [
+      ["number", (task) => task],
+      ["gain, largest first", (task) => log.judgedMean(task, 0) - log.judgedMean(task, log.numJudged - 1)],
+    ];
+    const { optimum } = data;
+    if (optimum) orders.push(["regret, largest first", (task) => log.judgedMean(task, log.numJudged - 1) - optimum[task]]);
+    const final = (/** @type {Log} */ one, /** @type {number} */ task) => one.judgedMean(task, one.numJudged - 1);
+    for (const other of logs)
+      if (other !== log) orders.push([`loss against ${other.data.label}, largest first`, (task) => final(log, task) - final(other, task)]);
+    return orders;
+  }
+
+  prepareTasks() {
+    const names = this.logs.map((log, i) => element("option", { value: i }, log.data.label));
+    fill(byId("shown-run"), ...names.map((name) => name.cloneNode(true)));
+    fill(byId("run"), ...names);
+    for (const id of ["shown-run", "run"]) {
+      byId(id).parentElement.hidden = this.logs.length < 2;
+      byId(id).addEventListener("change", () => this.go({ ...this.place, run: Number(byId(id).value) }));
+    }
+    byId("sort").addEventListener("change", () => this.sortTasks());
+    const buttons = this.data.tasks.map(({ text }, task) => {
+      const canvas = this.world ? element("canvas", { "aria-hidden": "true" }) : null;
+      return element("button", { "data-task": task, title: text, onclick: () => this.chooseTask(task) }, canvas, element("span", {}));
+    });
+    fill(byId("tasks"), ...buttons);
+    this.buttons = buttons;
+  }
+
+  /** @param {number} task */
+  chooseTask(task) {
+    this.go({ ...this.place, task });
+    byId("viewer").scrollIntoView({ behavior: "smooth" });
+  }
+
+  sortTasks() {
+    const [, by] = this.orders()[byId("sort").selectedIndex] ?? this.orders()[0];
+    const order = range(this.data.tasks.length).sort((a, b) => by(a) - by(b) || a - b);
+    byId("tasks").append(...order.map((task) => this.buttons?.[task]));
+  }
+
+  showTasks() {
+    const { log, data } = this, last = log.numJudged - 1, { optimum } = data;
+    const chosen = Math.max(byId("sort").selectedIndex, 0);
+    fill(byId("sort"), ...this.orders().map(([name], i) => element("option", { value: i, selected: i === chosen }, name)));
+    byId("tasks-note").textContent = "Below each task: its number and the mean return at the end." +
+      (optimum ? " A double frame: optimal with every seed." : "");
+    this.buttons?.forEach((button, task) => {
+      const value = log.judgedMean(task, last);
+      const solved = Boolean(optimum) && range(log.numSeeds).every((seed) => (optimum?.[task] ?? 0) - log.judged(seed, task, last) < SOLVED);
+      button.classList.toggle("solved", solved);
+      button.querySelector("span").textContent = `${task}: ${value.toFixed(2)}`;
+      button.setAttribute("aria-label", `task ${task}, ${data.tasks[task].text}, return ${value.toFixed(2)}${solved ? ", solved" : ""}`);
+    });
+    this.sortTasks();
+    this.drawThumbnails();
+  }
+
+  drawThumbnails() {
+    const { world } = this;
+    if (!world) return;
+    this.buttons?.forEach((button, task) => {
+      const episode = this.log.numEpisodes - 1;
+      const goals = this.log.hasPrompts ? this.log.prompt(this.log.ofRound("best", 0, task, episode)) : [];
+      drawScene(button.querySelector("canvas"), world, this.data.world.facts, { task: this.data.tasks[task].task, goals, moments: [] });
+    });
+  }
+
+  prepareViewer() {
+    const step = (/** @type {number} */ by) => this.go({ ...this.place, episode: this.place.episode + by });
+    byId("back").addEventListener("click", () => step(-1));
+    byId("next").addEventListener("click", () => step(1));
+    byId("play").addEventListener("click", () => this.togglePlay());
+    byId("episode").addEventListener("input", () => this.go({ ...this.place, episode: Number(byId("episode").value) - 1 }));
+    byId("seed").addEventListener("change", () => this.go({ ...this.place, seed: Number(byId("seed").value) }));
+    byId("visits").addEventListener("change", () => this.draw());
+    document.addEventListener("keydown", (event) => {
+      const by = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+      const within = /** @type {Element} */ (event.target).matches?.("input, select, .wide");
+      if (by && !within && !event.altKey && !event.ctrlKey && !event.metaKey) step(by);
+    });
+    if (this.world) fill(byId("legend"), ...legendOf(this.world));
+  }
+
+  togglePlay() {
+    const stop = () => {
+      clearInterval(this.timer);
+      this.timer = 0;
+      byId("play").textContent = "Play";
+    };
+    if (this.timer) return stop();
+    if (this.place.episode >= this.log.numEpisodes - 1) this.go({ ...this.place, episode: 0 });
+    byId("play").textContent = "Pause";
+    this.timer = window.setInterval(() => {
+      if (this.place.episode >= this.log.numEpisodes - 1) stop();
+      else this.go({ ...this.place, episode: this.place.episode + 1 });
+    }, PLAY_MS);
+  }
+
+  /** The place that the address names: task, seed, episode and perhaps run. @returns {Place} */
+  fromAddress() {
+    const numbers = location.hash.slice(1).split(",").map(Number);
+    const [task, seed, episode, run] = numbers.map((number) => (Number.isInteger(number) ? number : undefined));
+    if (!location.hash) return this.place;
+    return {
+      task: task ?? 0, seed: seed ?? 0, run: run ?? this.place.run,
+      episode: (episode ?? this.place.episode + 1) - 1,
+    };
+  }
+
+  /** Show a place, or the nearest one that there is. @param {Place} wanted */
+  go(wanted) {
+    const within = (/** @type {number} */ value, /** @type {number} */ num) => Math.min(Math.max(value, 0), num - 1);
+    const before = this.place, run = within(wanted.run, this.logs.length), log = this.logs[run];
+    this.place = {
+      run, task: within(wanted.task, log.numTasks), seed: within(wanted.seed, log.numSeeds), episode: within(wanted.episode, log.numEpisodes),
+    };
+    if (before.run !== run || !this.shown) this.showRun();
+    this.shown = true;
+    const { task, seed, episode } = this.place;
+    const hash = `#${task},${seed},${episode + 1}${run ? `,${run}` : ""}`;
+    if (location.hash !== hash) history.replaceState(null, "", hash);
+    this.show();
+  }
+
+  showRun() {
+    const { log } = this;
+    byId("shown-run").value = byId("run").value = String(this.place.run);
+    fill(byId("seed"), ...range(log.numSeeds).map((seed) => element("option", { value: seed }, String(seed))));
+    byId("episode").max = log.numEpisodes;
+    byId("arms-section").hidden = !log.hasArms && !log.data.note;
+    byId("visits-label").hidden = byId("legend").hidden = !this.canDraw;
+    const whole = this.data.withEpisodes ? "" : "What the episodes did is left out, since the page would be too large.";
+    byId("stage-note").textContent = whole || (this.canDraw || log.hasReached ? "" : "These results do not hold what their episodes did.");
+    fill(byId("stage-place"), this.canDraw ? element("canvas", { class: "stage still", id: "stage", role: "img" }) : null);
+    this.walks.clear();
+    this.showTasks();
+  }
+
+  show() {
+    const { log, data, place: { run, task, seed, episode } } = this;
+    byId("stage-title").textContent = `Task ${task}, seed ${seed}, episode ${episode + 1}`;
+    byId("seed").value = String(seed);
+    byId("episode").value = String(episode + 1);
+    byId("back").disabled = episode === 0;
+    byId("next").disabled = episode === log.numEpisodes - 1;
+    this.buttons?.forEach((button, i) => {
+      button.setAttribute("aria-pressed", String(i === task));
+    });
+    const best = Math.max(...range(episode + 1).map((e) => log.return_(seed, task, e)));
+    const optimum = data.optimum ? `, optimum ${data.optimum[task].toFixed(2)}` : "";
+    byId("verdict").textContent = `Return ${log.return_(seed, task, episode).toFixed(2)} (best so far ${best.toFixed(2)}${optimum})`;
+    const greedy = log.hasPrompts ? (log.ofRound("greedy", seed, task, episode) ? "greedy actions" : "sampled actions") : "";
+    byId("kind").textContent = [data.tasks[task].text, greedy, this.logs.length > 1 ? this.logs[run].data.label : ""].filter(Boolean).join("; ");
+    if (log.hasPrompts) {
+      showPrompt(byId("chips"), log.prompt(log.ofRound("choice", seed, task, episode)), this.goalName);
+      showPrompt(byId("best"), log.prompt(log.ofRound("best", seed, task, episode)), this.goalName);
+    }
+    fill(byId("returns"), this.returnsChart());
+    this.showArms();
+    this.draw();
+  }
+
+  /** The moments of an episode, played again by the rules. @param {number} episode */
+  walk(episode) {
+    const { world, log, place: { task, seed } } = this, at = log.at(seed, task, episode);
+    if (!this.walks.has(at) && world) {
+      const play = world.play(this.data.world.facts, this.data.tasks[task].task);
+      play.reset(log.start(seed, task, episode));
+      const moments = [play.moment()];
+      for (const action of Array.from(log.actions(seed, task, episode))) {
+        play.step(action);
+        moments.push(play.moment());
+      }
+      this.walks.set(at, moments);
+    }
+    return this.walks.get(at) ?? [];
+  }
+
+  draw() {
+    const { world, log, data, place: { task, seed, episode } } = this;
+    if (world && this.canDraw) {
+      const goals = log.hasPrompts ? log.prompt(log.ofRound("choice", seed, task, episode)) : [];
+      const earlier = byId("visits").checked ? range(episode + 1).map((e) => this.walk(e)) : undefined;
+      drawScene(byId("stage"), world, data.world.facts, { task: data.tasks[task].task, goals, moments: this.walk(episode), earlier });
+    } else if (log.hasReached) fill(byId("stage-place"), this.timeline());
+  }
+
+  /** The goals that the episode reached, in the order of their steps. */
+  timeline() {
+    const { log, place: { task, seed, episode } } = this, reached = log.reached(seed, task, episode);
+    const names = [...new Set([...this.data.world.parts, ...reached.map(({ goal }) => this.goalName(goal))])].slice(0, 40);
+    const last = Math.max(1, ...range(log.numEpisodes).flatMap((e) => log.reached(seed, task, e).map(({ step }) => step)));
+    const width = chartWidth(640), left = 120, row = 34, x = scale(0, last, left, width - 24), height = row * names.length + 34;
+    const text = reached.map(({ step, goal }) => `${this.goalName(goal)} in step ${step}`).join(", ") || "no goal was reached";
+    return svg("svg", { viewBox: `0 0 ${width} ${height}`, class: "chart timeline", role: "img", "aria-label": `Goals reached: ${text}` },
+      ...names.flatMap((name, i) => [
+        svg("line", { x1: left, x2: width - 12, y1: row * (i + 0.5), y2: row * (i + 0.5), class: "grid" }),
+        svg("text", { x: left - 10, y: row * (i + 0.5) + 4, "text-anchor": "end" }, name.slice(0, 22)),
+      ]),
+      ...ticks(0, last, 5).map((step) => svg("text", { x: x(step), y: height - 8, "text-anchor": "middle" }, String(step))),
+      svg("text", { x: 8, y: height - 8 }, "step"),
+      ...reached.flatMap(({ step, goal }, i) => {
+        const y = row * (names.indexOf(this.goalName(goal)) + 0.5);
+        return [svg("circle", { cx: x(step), cy: y, r: 11, fill: log.data.color }), svg("text", { x: x(step), y: y + 4.5, "text-anchor": "middle", class: "on" }, String(i + 1))];
+      }));
+  }
+
+  returnsChart() {
+    const { log, place: { task, seed, episode } } = this, width = chartWidth(480), height = 190, left = 44;
+    const values = range(log.numEpisodes).map((e) => log.return_(seed, task, e));
+    const optimum = this.data.optimum?.[task];
+    const all = optimum === undefined ? values : [...values, optimum];
+    const low = Math.min(...all), high = Math.max(...all);
+    const x = scale(0, Math.max(1, log.numEpisodes - 1), left + 6, width - 18), y = scale(low, low === high ? low + 1 : high, height - 34, 12);
+    const isGreedy = (/** @type {number} */ e) => log.hasPrompts && Boolean(log.ofRound("greedy", seed, task, e));
+    const drawing = svg("svg", {
+      viewBox: `0 0 ${width} ${height}`, class: "chart", role: "img", "aria-label": `Returns of ${log.numEpisodes} episodes, from ${low.toFixed(2)} to ${high.toFixed(2)}`,
+      onclick: (/** @type {MouseEvent} */ event) => {
+        const box = drawing.getBoundingClientRect(), at = ((event.clientX - box.left) / box.width) * width;
+        const wanted = Math.round(((at - left - 6) / (width - 24 - left)) * (log.numEpisodes - 1));
+        this.go({ ...this.place, episode: wanted });
+      },
+    },
+    ...(low === high ? [low] : ticks(low, high, 4)).flatMap((value) => [
+      svg("line", { x1: left, x2: width, y1: y(value), y2: y(value), class: "grid" }),
+      svg("text", { x: left - 6, y: y(value) + 4, "text-anchor": "end" }, String(Number(value.toFixed(3)))),
+    ]),
+    optimum === undefined ? null : svg("line", { x1: left, x2: width, y1: y(optimum), y2: y(optimum), class: "optimum" }),
+    ...ticks(1, Math.max(2, log.numEpisodes), 5).map((e) => svg("text", { x: x(e - 1), y: height - 16, "text-anchor": "middle" }, String(e))),
+    svg("text", { x: (left + width) / 2, y: height - 2, "text-anchor": "middle" }, "episode"),
+    ...values.map((value, e) => svg("circle", {
+      cx: x(e), cy: y(value), r: e === episode ? 7 : 3.4, fill: isGreedy(e) || e === episode ? log.data.color : "none", stroke: log.data.color, "stroke-width": 1.3,
+    })));
+    return element("div", {}, drawing, element("p", { class: "quiet" }, "Full: greedy. Ring: sampled. Large: this episode. Dashed: optimum. Click to choose."));
+  }
+
+  showArms() {
+    const { log, place: { task, seed, episode } } = this;
+    if (!log.hasArms) return void (byId("arms").textContent = log.data.note);
+    const rows = log.arms(seed, task, episode);
+    const cells = rows.map(({ goals, pulls, mean: value, isNew, isChanged }, i) =>
+      element("tr", { class: isChanged ? "now" : null },
+        element("td", {}, `${i + 1}${isNew ? " new" : isChanged ? " acted" : ""}`), element("td", {}, goals.map(this.goalName).join(" → ")),
+        element("td", {}, String(pulls)), element("td", {}, value.toFixed(2))));
+    fill(byId("arms"), element("table", {},
+      element("thead", {}, element("tr", {}, ...["arm", "prompt", "episodes", "mean return"].map((name) => element("th", { scope: "col" }, name)))),
+      element("tbody", {}, ...cells)));
+  }
+}
+
+/** @param {(WorldPage | null)[]} worlds @param {ReportData} data */
+export async function main(worlds, data) {
+  const logs = await Promise.all(data.runs.map((run) => Log.of(run)));
+  new Report(worlds[0], data, logs).begin();
+  document.body.dataset.ready = "yes";
+}

@@ -1,0 +1,137 @@
+"""What a search knew after each episode, recomputed by telling its optimizer the recorded episodes again.
+
+Methods that keep a table of arms (``mgpo_jax.optimizers.arms``) decide about it by returns alone, so that
+no episode has to be played for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.base import EnvSpec, Episode, Trajectory
+from envs.errors import DataError
+from experiments.store.layout import CONFIG
+from experiments.store.results import Results
+from mgpo_jax.adaptation import Adapter
+from mgpo_jax.methods import METHODS, Setting
+from mgpo_jax.optimizers.arms import Arms
+from mgpo_jax.prompts import Prompt
+from mgpo_jax.rollout import Query
+from mgpo_jax.transformer import network_config
+
+NO_ARM = 255  # an episode that changed none; a table has at most 64 rows
+
+
+class Knowledge(NamedTuple):
+    """The row of the table of arms that each episode changed, and what stood in it then."""
+
+    row: np.ndarray
+    """``[S, N, E]`` uint8; ``NO_ARM`` where none changed."""
+    pulls: np.ndarray
+    """``[S, N, E]``: episodes of this arm so far; 1 for a new arm, which has the prompt of this episode."""
+    mean: np.ndarray
+    """``[S, N, E]`` float32: mean return of this arm so far."""
+
+
+def knowledge_of(results: Results) -> Knowledge | None:
+    """What a search knew after each episode, or None for a method without a table of arms.
+
+    Raises:
+      DataError: if the method, as it is now, does not come to the prompts on record.
+    """
+    adapter = _adapter_of(results)
+    if adapter is None:
+        return None
+    spec = results.world.make().spec
+    names = ("prompt.goals", "prompt.mask", "greedy")
+    goals, mask, greedy = (jnp.asarray(results.choices[name]) for name in names)
+    blank = _blank_episode(spec)
+
+    def lane(
+        blank: Episode, task_goal: Any, goals: Any, mask: Any, greedy: Any, returns: Any
+    ) -> Any:
+        def told(state: Any, row: Any) -> Any:
+            goals, mask, greedy, return_ = row
+            key = jax.random.key(0)  # draws new prompts, of which the record has the real ones
+            _, asked = adapter.ask(key, state)
+            query = Query(Prompt(goals, mask), greedy)
+            episodes = jax.tree.map(
+                lambda leaf: jnp.asarray(leaf)[None], blank._replace(return_=return_)
+            )
+            after = adapter.tell(key, asked, query, episodes)
+            return after, _change(state.arms, after.arms, query.prompt)
+
+        first = adapter.init(jax.random.key(0), task_goal)
+        return jax.lax.scan(told, first, (goals, mask, greedy, returns))[1]
+
+    lanes = jax.jit(jax.vmap(jax.vmap(lane, (None, 0, 0, 0, 0, 0)), (None, None, 0, 0, 0, 0)))
+    found = lanes(
+        blank, jnp.asarray(results.task_goals), goals, mask, greedy, jnp.asarray(results.returns)
+    )
+    row, pulls, mean, fits = (np.asarray(leaf) for leaf in found)
+    if not fits.all():
+        raise DataError(
+            f"{results.method}, told the recorded returns, acts with other prompts than those on record: "
+            "they were made by another version"
+        )
+    return Knowledge(row.astype(np.uint8), pulls.astype(np.uint8), mean)
+
+
+def _adapter_of(results: Results) -> Adapter | None:
+    """The method of some results, with their settings; None for one without arms, or not of today."""
+    config = results.config
+    slots = results.choices["prompt.mask"].shape[-1] if "prompt.mask" in results.choices else 0
+    values = config.get("hyper")
+    if not slots or "greedy" not in results.choices or not isinstance(values, Mapping):
+        return None
+    try:
+        method = METHODS.known(results.method, results.folder or CONFIG)
+        hyper = method.hyper_from(values)
+        env = results.world.make()
+        setting = Setting(
+            env=env,
+            network=network_config(env.spec, max_prompt_length=slots),
+            num_episodes=results.returns.shape[2],
+            judged=results.world.judged,
+        )
+        method.check_use(setting, hyper)
+        adapter = method.adapter(setting, None, hyper)  # no weights: nobody acts
+        state = jax.eval_shape(adapter.init, jax.random.key(0), jnp.zeros(env.spec.goal_dim))
+    except Exception:  # a method of a user that needs its weights, or settings of an older version
+        return None
+    has_arms = isinstance(getattr(state, "arms", None), Arms)
+    return adapter if has_arms and adapter.episodes_per_round == 1 else None
+
+
+def _blank_episode(spec: EnvSpec) -> Episode:
+    """An episode of which only the return will matter."""
+    steps = spec.horizon
+    obs = jnp.zeros((steps, *spec.obs.shape), spec.obs.dtype)
+    actions = jnp.zeros((steps, *spec.zero_action().shape), spec.zero_action().dtype)
+    nothing = jnp.zeros((steps, spec.goal_dim))
+    trajectory = Trajectory(obs, actions, nothing, jnp.zeros(steps, bool), nothing, jnp.int32(0))
+    return Episode(trajectory, jnp.zeros(steps), jnp.float32(0), obs[0])
+
+
+def _change(before: Arms, after: Arms, prompt: Prompt) -> tuple[Any, Any, Any, Any]:
+    """The row that differs, its pulls, its mean, and whether the prompt of the episode is in it."""
+    num = len(before.pulls)
+    differs = jnp.zeros(num, bool)
+    for old, new in zip(_rows(before), _rows(after), strict=True):
+        differs |= jnp.any((old != new).reshape(num, -1), axis=1)
+    changed, row = jnp.any(differs), jnp.argmax(differs)
+    held = after.prompt(row)
+    same = jnp.all(held.mask == prompt.mask) & jnp.all(
+        jnp.where(prompt.mask[:, None], held.goals == prompt.goals, True)
+    )
+    return jnp.where(changed, row, NO_ARM), after.pulls[row], after.mean[row], same | ~changed
+
+
+def _rows(arms: Arms) -> list[jax.Array]:
+    """Everything that a table has in rows."""
+    return [leaf for leaf in jax.tree.leaves(arms) if jnp.ndim(leaf)]

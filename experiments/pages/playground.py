@@ -1,0 +1,84 @@
+"""The playground: a page in which anyone leads a frozen policy, and a search finds prompts for it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from flax.traverse_util import flatten_dict
+
+from envs.errors import UsageError
+from envs.registry import World
+from experiments.pages.build import SCRIPTS, html, script_of
+from experiments.pages.packing import packed
+from experiments.pages.worlds import page_of, tasks_in_page
+from mgpo_jax.policy import LoadedPolicy
+from mgpo_jax.policy_files import load_policy
+from mgpo_jax.tasks import test_tasks
+
+ENTRY = SCRIPTS / "playground.js"
+NETWORK = (
+    "goal_dim", "action_dim", "horizon", "max_prompt_length", "embed_dim", "num_layers", "num_heads",
+    "obs_mean", "obs_std",
+)  # fmt: skip
+"""What the decoder in the page has to know of a network."""
+
+
+def playground(worlds: Sequence[World], policy: Path | None = None) -> str:
+    """The page of some worlds, with their released policies or the one in a folder.
+
+    Raises:
+      UsageError: if a world or a policy cannot be played in a page, or there is no such policy.
+      DataError: if a policy is damaged or does not fit its world.
+    """
+    entries = [world_data(world, load_policy(world, policy)) for world in worlds]
+    scripts = [page_of(world).script for world in worlds]
+    body = (SCRIPTS / "playground.html").read_text(encoding="utf-8")
+    return html(body, script_of(ENTRY, scripts), {"worlds": entries})
+
+
+def world_data(world: World, policy: LoadedPolicy) -> dict[str, Any]:
+    """What the page has to know of one world and its policy, as JSON values."""
+    page, spec, network = page_of(world), world.make().spec, policy.config
+    if page.script is None:
+        raise UsageError(
+            f"{world.name} has no rules for a page, so that no playground can be made of it"
+        )
+    if network.head != "categorical" or network.encoder != "linear":
+        raise UsageError(
+            f"the policy of {world.name} has the head {network.head} and the encoder {network.encoder}; a "
+            "playground runs categorical and linear"
+        )
+    return {
+        "name": world.name,
+        "summary": world.summary,
+        "facts": dict(page.facts),
+        "tasks": tasks_in_page(page, test_tasks(world)),
+        "network": {name: getattr(network, name) for name in NETWORK},
+        "weights": packed(half_weights(policy)),
+        "sha256": policy.sha256,
+        "returnSpan": spec.return_range[1] - spec.return_range[0],
+        "deterministic": spec.deterministic,
+        "keepRewarded": spec.reward_confirms_goals,
+    }
+
+
+def half_weights(policy: LoadedPolicy) -> dict[str, np.ndarray]:
+    """The weights by their names in half precision.
+
+    Raises:
+      UsageError: if a weight is too large for it.
+    """
+    flat = flatten_dict(policy.params["params"], sep="/")
+    halves = {}
+    for name, leaf in flat.items():
+        with np.errstate(over="ignore"):
+            halves[name] = np.asarray(leaf).astype(np.float16)
+        if not np.isfinite(halves[name]).all():
+            raise UsageError(
+                f"the weight {name} of the policy is above 65504, the largest number of half precision, in "
+                "which a playground keeps weights"
+            )
+    return halves

@@ -1,0 +1,64 @@
+"""Show adaptations in one page: ``python -m experiments.report RUN_DIR [RUN_DIR ...]``."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NoReturn
+
+import tyro
+
+import envs
+from envs.errors import UsageError, printable
+from experiments.runtime import Common, run
+from mgpo_jax.claims import check_place
+from mgpo_jax.settings import Name
+
+
+@dataclass(frozen=True)
+class ReportConfig(Common):
+    """Settings of ``experiments.report``."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Result folders of adaptations to the same tasks."""
+    out: Path = Path("report.html")
+    """HTML file to write; it needs no other file, no server and no network."""
+    env: Name | None = None
+    """A world of your own that the results name, as module:attribute: files alone import nothing."""
+
+
+def main(config: ReportConfig) -> None:
+    """Make one HTML page of adaptations: curves, all tasks, and every episode to step through."""
+    if not config.runs:
+        raise UsageError("no result folder given; usage: python -m experiments.report RUN_DIR ...")
+    check_page(config.out)
+    if config.env is not None:
+        envs.find(config.env)  # from now on results may name its place
+    from experiments.pages.report import write_report
+
+    write_report(config.runs, config.out)
+    print(printable(str(config.out)), file=sys.stderr)
+
+
+def check_page(out: Path) -> None:
+    """Raise ``UsageError`` for a place where no page can be written, or where something else lies."""
+    from experiments.store.seals import check_replaceable
+
+    if not out.absolute().parent.is_dir():
+        raise UsageError(f"--out {out}: there is no folder {out.parent}; make it first")
+    if not os.path.lexists(out):
+        check_place(out)
+    if out.suffix != ".html":
+        raise UsageError(f"--out {out} must end in .html")
+    check_replaceable([out], "choose another file with --out")
+
+
+def command(argv: Sequence[str] | None = None) -> NoReturn:
+    run(ReportConfig, main, argv=argv)
+
+
+if __name__ == "__main__":
+    command()

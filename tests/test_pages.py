@@ -1,0 +1,457 @@
+"""The pages as files: what is in them, what they refuse, and that nothing in them is markup of a user."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from made_results import TINY, made_results
+
+from envs.errors import UsageError
+from envs.gridworld import GRIDWORLD
+from envs.maze import MAZE15
+from envs.registry import WORLDS, World
+from experiments.pages.build import SCRIPTS, Bundle, as_text, html, script_of
+from experiments.pages.knowledge import NO_ARM, knowledge_of
+from experiments.pages.packing import packed, smallest, unpacked
+from experiments.pages.playground import world_data
+from experiments.pages.report import report, report_data, report_of_run, write_report
+from experiments.pages.worlds import page_of
+from experiments.playground import PlaygroundConfig
+from experiments.playground import main as playground_main
+from experiments.report import ReportConfig
+from experiments.report import main as report_main
+from experiments.store.results import Results, load_results, save_results
+from experiments.store.rows import read_row
+from experiments.store.seals import is_sealed
+from experiments.store.summary import summarize
+from mgpo_jax.policy_files import load_policy
+
+ROOT = Path(__file__).parents[1]
+HOSTILE = "</script><script>alert(1)</script><b onclick=x>&amp;\u2028"
+DRAWN = replace(TINY, page=MAZE15.page)
+PLAIN = replace(TINY, name="plain", pictures=None)
+
+
+@pytest.fixture(autouse=True)
+def made_worlds(monkeypatch: pytest.MonkeyPatch) -> None:
+    made, find = {"tiny": DRAWN, "plain": PLAIN}, WORLDS.find
+    monkeypatch.setattr(WORLDS, "find", lambda name: made.get(name) or find(name))
+
+
+def saved(folder: Path, results: Results) -> Path:
+    summary = summarize(
+        results, policy_sha256="0" * 64, num_episodes=80, num_failed=0, cpu_seconds=1.0
+    )
+    save_results(folder, replace(results, summary=summary))
+    return folder
+
+
+@pytest.fixture
+def result(tmp_path: Path) -> Path:
+    return saved(tmp_path / "result", made_results(config=config_of("tiny")))
+
+
+def config_of(env: str, method: str = "ucb", **more: Any) -> dict[str, Any]:
+    return {"env": env, "method": method, "policy": None, **more}
+
+
+class Elements(HTMLParser):
+    """The elements of a page, with the content of scripts and styles."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+        self.texts: dict[int, str] = {}
+        self.is_open = False
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+        self.is_open = True
+
+    def handle_endtag(self, tag: str) -> None:
+        self.is_open = False
+
+    def handle_data(self, data: str) -> None:
+        place = len(self.found) - 1
+        if self.is_open:
+            self.texts[place] = self.texts.get(place, "") + data
+
+    def of(self, tag: str) -> list[tuple[dict[str, str | None], str]]:
+        return [
+            (attrs, self.texts.get(place, ""))
+            for place, (name, attrs) in enumerate(self.found)
+            if name == tag
+        ]
+
+
+def data_of(page: str) -> Any:
+    (text,) = [text for attrs, text in Elements(page).of("script") if attrs.get("id") == "data"]
+    return json.loads(text)
+
+
+def test_modules_are_joined_each_once_and_behind_what_they_import(tmp_path: Path) -> None:
+    (tmp_path / "a.js").write_text(
+        'import { b } from "./b.js";\nimport { c } from "./c.js";\nexport const a = b + c;\n'
+    )
+    (tmp_path / "b.js").write_text('import { c } from "./c.js";\nexport const b = c;\n')
+    (tmp_path / "c.js").write_text("export const c = 1;\nexport function* d() {}\n")
+    bundle = Bundle()
+    assert bundle.add(tmp_path / "a.js") == bundle.add(tmp_path / "a.js")
+    assert [bundle.source.index(f"const {n} =") for n in "cba"] == sorted(
+        bundle.source.index(f"const {n} =") for n in "cba"
+    )
+    assert "return { c, d };" in bundle.source
+    assert not re.search(r"^(import|export)\b", bundle.source, re.M)
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "export let a = 1;",
+        "export default 1;",
+        'import * as b from "./b.js";',
+        'import { b as c } from "./b.js";',
+        'import { a } from "./a.js";',
+    ],
+)
+def test_other_module_syntax_is_refused(tmp_path: Path, source: str) -> None:
+    (tmp_path / "a.js").write_text(source)
+    (tmp_path / "b.js").write_text("export const b = 1;")
+    with pytest.raises(ValueError, match=r"a\.js"):
+        Bundle().add(tmp_path / "a.js")
+
+
+def test_packed_arrays_come_back() -> None:
+    rng = np.random.default_rng(0)
+    arrays = {
+        "a": rng.normal(size=(3, 4)).astype(np.float32),
+        "b": rng.normal(size=5).astype(np.float16),
+        "c": smallest(rng.integers(0, 300, (2, 0, 3))),
+        "d": smallest(np.array([[70_000, 1]])),
+        "e": smallest(np.array([255])),
+    }
+    found = unpacked(json.loads(as_text(packed(arrays))))
+    assert {name: array.dtype for name, array in found.items()} == {
+        name: array.dtype for name, array in arrays.items()
+    }
+    assert arrays["d"].dtype == np.uint32
+    assert arrays["e"].dtype == np.uint8
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(found[name], array)
+    with pytest.raises(ValueError, match="float64"):
+        packed({"a": np.zeros(1)})
+
+
+def test_json_in_a_page_holds_no_markup() -> None:
+    text = as_text({HOSTILE: [HOSTILE, 1.5, None]})
+    assert json.loads(text) == {HOSTILE: [HOSTILE, 1.5, None]}
+    assert not set("<>&\u2028") & set(text)
+    with pytest.raises(ValueError, match="JSON"):
+        as_text(float("nan"))
+
+
+def test_the_policy_allows_the_own_script_and_style_and_nothing_else() -> None:
+    page = html("<p>x</p>\n", script_of(SCRIPTS / "report.js", [None]), {"runs": []})
+    elements = Elements(page)
+    (policy,) = [a["content"] for a, _ in elements.of("meta") if a.get("http-equiv")]
+    assert policy is not None
+    rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
+    assert rules["default-src"] == "'none'"
+    assert rules["img-src"] == "data:"
+    scripts = [text for attrs, text in elements.of("script") if "type" not in attrs]
+    for rule, contents in (("script-src", scripts), ("style-src", [elements.of("style")[0][1]])):
+        (content,) = contents
+        digest = base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()
+        assert rules[rule] == f"'sha256-{digest}'"
+    loads = {"src", "href", "action", "style", "srcset"}
+    assert not [
+        attrs
+        for _, attrs in elements.found
+        if loads & attrs.keys() or any(n.startswith("on") for n in attrs)
+    ]
+
+
+@pytest.mark.parametrize("script", ["x = '</SCRIPT>'", "// <!-- <script>"])
+def test_a_script_that_would_end_its_element_is_refused(script: str) -> None:
+    with pytest.raises(ValueError, match="must not hold"):
+        html("", script, {})
+
+
+@pytest.mark.parametrize("name", ["report", "playground"])
+def test_the_markup_has_every_element_that_the_script_asks_for(name: str) -> None:
+    elements = Elements((SCRIPTS / f"{name}.html").read_text())
+    ids = [attrs["id"] for _, attrs in elements.found if "id" in attrs]
+    asked = set(re.findall(r'byId\("([\w-]+)"\)', (SCRIPTS / f"{name}.js").read_text()))
+    asked |= set(re.findall(r'listen\("([\w-]+)"', (SCRIPTS / f"{name}.js").read_text()))
+    assert len(set(ids)) == len(ids)
+    assert asked - {"stage"} <= set(ids)
+    labels = [attrs for tag, attrs in elements.found if tag == "input" and attrs["type"] == "range"]
+    assert all("aria-label" in attrs or name == "playground" for attrs in labels)
+
+
+def test_a_report_is_the_same_every_time_and_is_sealed(tmp_path: Path, result: Path) -> None:
+    write_report([result], tmp_path / "a.html")
+    write_report([result], tmp_path / "b.html")
+    content = (tmp_path / "a.html").read_bytes()
+    assert content == (tmp_path / "b.html").read_bytes()
+    assert is_sealed(content, ".html")
+    data = data_of(content.decode())
+    assert data["world"]["facts"]["side"] == 7
+    assert data["tasks"][1] == {
+        "task": {"rows": [
+            "#######", "#.....#", "#.#.#.#", "#.#...#", "#.....#", "#.#.#.#", "#######"
+        ], "goal": [5, 1]},
+        "text": "goal at row 5, column 1",
+    }  # fmt: skip
+    assert dict(data["runs"][0]["facts"])["tasks x seeds x episodes"] == "2 x 2 x 20"
+
+
+def test_an_adaptation_has_a_page_beside_its_pictures(
+    result: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One that was changed stays."""
+    report_of_run(result)
+    assert data_of((result / "report.html").read_text())["world"]["name"] == "tiny"
+    (result / "report.html").write_text("<p>mine</p>")
+    capsys.readouterr()
+    report_of_run(result)
+    assert (result / "report.html").read_text() == "<p>mine</p>"
+    assert "is kept" in capsys.readouterr().err
+
+
+def test_prompts_and_actions_in_a_report_are_those_of_the_results(result: Path) -> None:
+    results = load_results(result)
+    (run,) = report_data({result: results}, [read_row(result)])["runs"]
+    arrays = unpacked(run["arrays"])
+    coded, numbers, known = arrays["choice"].ravel(), [], 0
+    for code in coded.tolist():
+        numbers.append(code - 1 if code else known)
+        known += not code
+    for name, found in (("choices", numbers), ("best", arrays["best"].ravel().tolist())):
+        part = getattr(results, name)
+        where = np.ndindex(*part["prompt.mask"].shape[:3])
+        for place, number in zip(where, found, strict=True):
+            row = arrays["prompts"][number]
+            goals = arrays["goals"][row[row > 0] - 1]
+            np.testing.assert_array_equal(
+                goals, part["prompt.goals"][place][part["prompt.mask"][place]]
+            )
+    assert arrays["actions"].tolist() == [2] * 4 * 80
+    assert arrays["lengths"].tolist() == np.full((2, 2, 20), 4).tolist()
+
+
+def test_a_world_without_a_page_has_times_of_its_goals(tmp_path: Path) -> None:
+    folder = saved(tmp_path / "plain", made_results(config=config_of("plain")))
+    data = data_of(report([folder]))
+    arrays = unpacked(data["runs"][0]["arrays"])
+    assert "actions" not in arrays
+    assert arrays["reachedCounts"].sum() == len(arrays["reachedSteps"]) == 320
+    np.testing.assert_allclose(
+        arrays["goals"][arrays["reachedGoals"][:2]], np.array([(4, 3), (3, 3)]) / 7
+    )
+    assert data["tasks"][0] == {"task": None, "text": ""}
+    assert "[null]" in report([folder])
+
+
+def test_texts_of_files_enter_a_report_as_text(tmp_path: Path, result: Path) -> None:
+    for name, change in (
+        ("config.json", {"seed": 3, "hyper": {"c": HOSTILE}}),
+        ("meta.json", {"command": [HOSTILE], "revision": HOSTILE, "versions": {"jax": HOSTILE}}),
+    ):
+        path = result / name
+        path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    odd = tmp_path / "<script>alert(2)<"
+    odd.mkdir()
+    shutil.move(result, odd / "result")
+    page = report([odd / "result"])
+    assert len(Elements(page).of("script")) == 2
+    assert not Elements(page).of("b")
+    assert "<script>alert" not in page
+    facts = dict(data_of(page)["runs"][0]["facts"])
+    assert facts["revision"] == facts["command"] == HOSTILE
+    assert "alert(2)" in facts["folder"]
+
+
+def test_several_runs_are_compared_with_the_first(tmp_path: Path, result: Path) -> None:
+    other = saved(
+        tmp_path / "other", made_results("bpe", shift=0.25, config=config_of("tiny", "bpe"))
+    )
+    data = data_of(report([result, other, result]))
+    assert [run["comparison"] != "" for run in data["runs"]] == [False, True]
+    assert data["runs"][1]["comparison"].startswith("0.250")
+    assert len({run["color"] for run in data["runs"]}) == 2
+
+
+def test_runs_on_other_tasks_are_refused(tmp_path: Path, result: Path) -> None:
+    tasks = made_results().tasks
+    changed = {**tasks, "goal": tasks["goal"][::-1]}
+    other = saved(tmp_path / "other", made_results(tasks=changed, config=config_of("tiny")))
+    with pytest.raises(UsageError, match="ran on different tasks"):
+        report([result, other])
+
+
+def test_a_page_that_would_be_too_large_leaves_out_the_episodes(
+    result: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("experiments.pages.report.MOST_BYTES", 1)
+    data = data_of(report([result]))
+    assert not data["withEpisodes"]
+    assert "actions" not in unpacked(data["runs"][0]["arrays"])
+
+
+@pytest.mark.parametrize("method", ["ucb", "bpe", "explore"])
+@pytest.mark.parametrize("world", ["maze15", "gridworld"])
+def test_arms_are_those_of_an_adaptation(method: str, world: str) -> None:
+    """Of published results: means are those of the returns, and rows follow the rules of Algorithm 1."""
+    results = load_results(ROOT / "results" / world / method, parts=("choices",))
+    part = few_tasks(results, 4)
+    knowledge = knowledge_of(part)
+    assert knowledge is not None
+    rows, pulls, means = knowledge
+    assert (pulls[:, :, 0] == 1).all()
+    assert (rows[:, :, 0] == 0).all()
+    for seed, task in np.ndindex(3, 4):
+        history: dict[int, list[float]] = {}
+        for episode, row in enumerate(rows[seed, task].tolist()):
+            if row == NO_ARM:
+                continue
+            if pulls[seed, task, episode] == 1:
+                history[row] = []
+            history[row].append(float(part.returns[seed, task, episode]))
+            assert len(history[row]) == pulls[seed, task, episode]
+            assert np.mean(history[row]) == pytest.approx(means[seed, task, episode], abs=1e-4)
+
+
+def few_tasks(results: Results, num: int) -> Results:
+    def cut(parts: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        return {name: array[:, :num] for name, array in parts.items()}
+
+    return replace(
+        results,
+        tasks={name: array[:num] for name, array in results.tasks.items()},
+        returns=results.returns[:, :num],
+        choices=cut(results.choices),
+        best=cut(results.best),
+    )
+
+
+def test_a_record_that_the_method_does_not_come_to_is_named(result: Path) -> None:
+    """Made results have prompts that no search drew."""
+    path = result / "config.json"
+    config = json.loads(path.read_text())
+    path.write_text(json.dumps({**config, "hyper": {"c": 1.0}}))
+    (run,) = data_of(report([result]))["runs"]
+    assert "another version" in run["note"]
+    assert "arm" not in unpacked(run["arrays"])
+
+
+def test_methods_without_arms_and_older_settings_have_none(result: Path) -> None:
+    assert knowledge_of(load_results(result)) is None  # no hyper-parameters on record
+    for method in ("bbt", "grips"):
+        assert knowledge_of(few_tasks(load_results(ROOT / "results/maze15" / method), 1)) is None
+
+
+def test_a_report_of_15_000_episodes_is_small() -> None:
+    folder = ROOT / "results/maze15/ucb"
+    page = report([folder])
+    assert len(page) < 200_000
+    arrays = unpacked(data_of(page)["runs"][0]["arrays"])
+    assert arrays["lengths"].size == 15_000
+    assert arrays["lengths"].sum() == len(arrays["actions"]) == 307_562
+
+
+def test_a_playground_has_the_weights_in_half_precision() -> None:
+    policy = load_policy(GRIDWORLD)
+    data = world_data(GRIDWORLD, policy)
+    weights, like = unpacked(data["weights"]), policy.params["params"]
+    assert {array.dtype for array in weights.values()} == {np.dtype(np.float16)}
+    kernel = np.asarray(like["blocks_0"]["query"]["kernel"])
+    np.testing.assert_array_equal(weights["blocks_0/query/kernel"], kernel.astype(np.float16))
+    assert len(data["tasks"]) == 50
+    assert data["returnSpan"] == 1.0
+    assert (data["deterministic"], data["keepRewarded"]) == (False, True)
+
+
+def test_weights_that_half_precision_cannot_hold_are_refused() -> None:
+    policy = load_policy(MAZE15)
+    head = {**policy.params["params"]["head"], "bias": np.full(5, 1e5, np.float32)}
+    params = {"params": {**policy.params["params"], "head": head}}
+    with pytest.raises(UsageError, match="head/bias"):
+        world_data(MAZE15, policy._replace(params=params))
+
+
+def test_a_world_without_rules_has_no_playground() -> None:
+    with pytest.raises(UsageError, match="no rules for a page"):
+        world_data(PLAIN, load_policy(MAZE15))
+    assert page_of(World(name="none", make=PLAIN.make)).script is None
+
+
+@pytest.mark.parametrize(
+    ("config", "says"),
+    [
+        (ReportConfig(), "no result folder"),
+        (ReportConfig(runs=(Path("x"),), out=Path("report.txt")), "must end in .html"),
+        (ReportConfig(runs=(Path("x"),), out=Path("no/where.html")), "there is no folder no"),
+        (ReportConfig(runs=(Path("x"),), out=Path("mine.html")), "was not written by this command"),
+        (PlaygroundConfig(env=()), "names no world"),
+        (PlaygroundConfig(env=("maze15", "maze30"), policy=Path("x")), "page of one world"),
+        (PlaygroundConfig(env=("maze51",)), "did you mean"),
+        (PlaygroundConfig(out=Path("mine.html")), "was not written by this command"),
+    ],
+)
+def test_requests_that_cannot_be_met_are_refused(
+    config: Any, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mine.html").write_text("<p>mine</p>")
+    run = report_main if isinstance(config, ReportConfig) else playground_main
+    with pytest.raises(UsageError, match=re.escape(says)):
+        run(config)
+    assert Path("mine.html").read_text() == "<p>mine</p>"
+
+
+def test_the_commands_write_and_replace_their_pages(
+    tmp_path: Path, result: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for _ in range(2):
+        report_main(ReportConfig(runs=(result,)))
+        playground_main(PlaygroundConfig())
+    assert is_sealed(Path("playground.html").read_bytes(), ".html")
+    assert data_of(Path("playground.html").read_text())["worlds"][0]["name"] == "maze15"
+
+
+def test_the_documented_playground_is_of_today() -> None:
+    """``docs/playground.html`` is built by a command; docs/pages.md says by which."""
+    page = (ROOT / "docs/playground.html").read_text()
+    data = data_of(page)
+    names = [world["name"] for world in data["worlds"]]
+    assert names == ["maze15", "gridworld", "maze30"]
+    worlds = [WORLDS.find(name) for name in names]
+    script = script_of(SCRIPTS / "playground.js", [page_of(world).script for world in worlds])
+    assert f"<script>{script}</script>" in page, "build docs/playground.html again (docs/pages.md)"
+    assert f"<style>{(SCRIPTS / 'style.css').read_text()}</style>" in page
+    for world, kept in zip(worlds, data["worlds"], strict=True):
+        assert kept["sha256"] == load_policy(world).sha256
+
+
+def test_the_scripts_are_well_typed() -> None:
+    tsc = shutil.which("tsc")
+    if tsc is None:
+        pytest.skip("no tsc on the PATH checks the types of the JavaScript")
+    done = subprocess.run(
+        [tsc, "-p", ROOT / "experiments/pages"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout
