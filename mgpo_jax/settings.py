@@ -37,7 +37,8 @@ BatchSize = Annotated[int, Ge(1), Le(65_536)]
 Width = Annotated[int, Ge(1), Le(16_384)]
 NumLayers = Annotated[int, Ge(1), Le(256)]
 
-Encoder = Literal["linear"]
+TokensPerStep = Literal[2, 1]
+Encoder = Literal["linear", "cells"]
 """The names in ``encoders.ENCODERS``, which need jax."""
 Head = Literal["categorical", "gaussian", "fixed_gaussian", "mixture", "binned"]
 """The names in ``distributions.HEADS``, which need jax."""
@@ -86,7 +87,7 @@ def check_values(settings_class: type, values: Mapping[str, Any]) -> None:
             continue
         choices = [part for part in get_parts(annotation) if get_origin(part) is Literal]
         if choices and isinstance(value, str):
-            raise nearest(value, get_args(choices[0]), flag(name))
+            raise nearest(value, list(map(str, get_args(choices[0]))), flag(name))
         raise UsageError(f"{flag(name)} {said}")
 
 
@@ -125,7 +126,8 @@ RECIPE_NETWORK: dict[str, Any] = {"dropout": 0.0, "num_heads": 4}
 """How the network of the general recipe differs from the paper's (Table 6)."""
 
 OF_WEIGHTS = (
-    "max_prompt_length", "prompt_order", "embed_dim", "num_layers", "num_heads", "encoder", "head"
+    "max_prompt_length", "prompt_order", "embed_dim", "num_layers", "num_heads", "encoder", "head",
+    "tokens_per_step",
 )  # fmt: skip
 """Settings of a network that its weights were made for; dropout is none, since it only trains."""
 
