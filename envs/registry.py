@@ -73,8 +73,6 @@ class World:
       page: what the world brings to HTML pages; None shows what needs nothing of it.
       policy_of: the world whose released policy and test tasks this one uses [its own].
       judged: how policies are judged here; every table follows it.
-      method_defaults: what the world changes in the default hyper-parameters of methods, by the name of the
-        method, such as the unit of returns in which a bandit counts.
       num_test_tasks: how many tasks are kept for test.
       official: the program by others that this world re-implements, to compare it with [none].
     """
@@ -88,7 +86,6 @@ class World:
     page: Callable[[Any], Page] | None = None
     policy_of: str | None = None
     judged: Judgement = field(default_factory=Judgement)
-    method_defaults: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     num_test_tasks: int = 50
     official: Callable[[Any], Official] | None = None
 
@@ -221,8 +218,6 @@ WORLDS: Registry[World] = Registry(
         "kitchen-mjx": "envs.kitchen:KITCHEN_MJX",
         "kitchen-native": "envs.kitchen:KITCHEN_NATIVE",
         "kitchen-stock": "envs.kitchen:KITCHEN_STOCK",
-        "crafter": "envs.crafter:CRAFTER",
-        "crafter-symbolic": "envs.crafter:CRAFTER_SYMBOLIC",
     },
 )
 

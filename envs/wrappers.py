@@ -42,10 +42,6 @@ class Wrapper(Environment):
     def solvable(self, task: Task) -> Bool[Array, ""]:
         return self.env.solvable(task)
 
-    @property
-    def goal_names(self) -> tuple[str, ...]:
-        return self.env.goal_names
-
     def num_parts(self, task: Task) -> Int[Array, ""]:
         return self.env.num_parts(task)
 

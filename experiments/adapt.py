@@ -18,14 +18,14 @@ from mgpo_jax.settings import flag
 
 
 def adapt_default(config: AdaptConfig, flags: Iterable[str] = ()) -> AdaptConfig:
-    """The defaults, with the hyper-parameters of the method that a config names in its world.
+    """The defaults, with the hyper-parameters of the method that a config names.
 
     Args:
       config: settings without hyper-parameters.
       flags: what else the command line gives.
 
     Raises:
-      UsageError: for a flag that belongs to another method, or a world or method that does not exist.
+      UsageError: for a flag that belongs to another method.
     """
     method = methods.find(config.method)
     own = {field.name for field in dataclasses.fields(method.hyper)}
@@ -33,8 +33,7 @@ def adapt_default(config: AdaptConfig, flags: Iterable[str] = ()) -> AdaptConfig
     for name in sorted(others - own):
         if not {flag(name), flag(f"no_{name}")}.isdisjoint(flags):
             raise foreign_setting(name, method)
-    hyper = method.hyper_in(envs.find(config.env))
-    return AdaptConfig(method=config.method, hyper=hyper)
+    return AdaptConfig(method=config.method, hyper=method.hyper())
 
 
 def main(config: AdaptConfig) -> None:

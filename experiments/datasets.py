@@ -29,7 +29,7 @@ from experiments.store.provenance import provenance, versions
 from experiments.store.settings import CollectConfig, PretrainConfig, dataset_folder
 from experiments.store.work import PIECES, long_work
 from mgpo_jax.claims import check_place
-from mgpo_jax.dataset import Dataset, hash_task, load_dataset, write_dataset
+from mgpo_jax.dataset import STEP_ARRAYS, Dataset, hash_task, load_dataset, write_dataset
 from mgpo_jax.files import ExistsError, remove_leftovers
 from mgpo_jax.journal import Journal
 from mgpo_jax.progress import Progress
@@ -133,7 +133,7 @@ def _rows(found: Demonstration, hashes: np.ndarray, rows: np.ndarray) -> dict[st
     """What a dataset keeps of some demonstrations."""
     episode, trajectory = found.episode, found.episode.trajectory
     real = np.arange(trajectory.goal_reached.shape[1]) < trajectory.length[rows, None]
-    steps = {name: np.asarray(array)[rows][real] for name, array in trajectory.steps.items()}
+    steps = {name: np.asarray(getattr(trajectory, name))[rows][real] for name in STEP_ARRAYS}
     return {
         **steps,
         "lengths": trajectory.length[rows],

@@ -9,6 +9,7 @@ from dataclasses import fields, replace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
@@ -33,12 +34,11 @@ from mgpo_jax.checkpoint import Snapshot, checkpoints, restore_state, save_state
 from mgpo_jax.claims import claimed
 from mgpo_jax.dataset import BatchPlan, Dataset
 from mgpo_jax.files import remove_unfinished, to_json, written
-from mgpo_jax.optimizers.methods import judged_query
 from mgpo_jax.policy import LoadedPolicy, transformer_policy
 from mgpo_jax.policy_files import MEND, read_policy, save_policy
 from mgpo_jax.progress import Progress
 from mgpo_jax.prompts import Prompt, sample_prompt, single_goal
-from mgpo_jax.rollout import rollout
+from mgpo_jax.rollout import Query, rollout
 from mgpo_jax.runner import together
 from mgpo_jax.sharding import device_mesh, largest_divisor
 from mgpo_jax.tasks import EVAL_SEED, evaluation_tasks
@@ -85,9 +85,7 @@ def configured_network(
 
 
 class GreedyEvaluation:
-    """Mean returns on tasks of its own, none of them a test task, where the data were collected.
-
-    The policy acts as the world judges, greedily unless its record says otherwise, in one episode a task.
+    """Mean greedy returns on tasks of its own, none of them a test task, where the data were collected.
 
     ``initial`` is the return of the prompt (g^M); ``followed`` that of a prompt drawn from a perfect
     demonstration of the task, which says how well the policy does what a good prompt tells it. The latter
@@ -123,11 +121,11 @@ class GreedyEvaluation:
             prompt = sample_prompt(key_prompt, goals, place.task_goal(task), num_slots, kept=kept)
             return prompt, episode.return_
 
-        def judged_return(params: Any, key: PRNGKeyArray, task: Task, prompt: Prompt) -> Array:
+        def greedy_return(params: Any, key: PRNGKeyArray, task: Task, prompt: Prompt) -> Array:
             policy = transformer_policy(network, params)
-            return rollout(key, place, policy, task, judged_query(prompt, world.judged)).return_
+            return rollout(key, place, policy, task, Query(prompt, jnp.ones((), bool))).return_
 
-        self._returns = together(place, judged_return, in_axes=(None, 0, 0, 0))
+        self._returns = together(place, greedy_return, in_axes=(None, 0, 0, 0))
         self._initial = jax.vmap(lambda task: single_goal(place.task_goal(task), num_slots))(
             self.tasks
         )

@@ -6,16 +6,14 @@ Everything here is for one task; callers ``vmap`` over tasks and seeds.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, Shaped
 
-from envs.base import Agent, Environment, EnvSpec, Episode, Goals, Task, Trajectory
+from envs.base import Agent, Environment, EnvSpec, Episode, Goals, Task
 from envs.episodes import run_episode
-from mgpo_jax.prompts import hindsight_outcome
 from mgpo_jax.trees import choose, put_row
 
 
@@ -83,24 +81,6 @@ class Judged(NamedTuple):
     """Mean return."""
     num_failed: Int[Array, "*batch"]
     """How many episodes ended because the world broke down."""
-    achieved: Float[Array, "*batch M"] | None = None
-    """Share of the episodes that achieved each of the world's M named goals; None in worlds without any."""
-
-
-def judge(
-    returns: Float[Array, "J"],
-    failed: Bool[Array, "J"],
-    achieved: Bool[Array, "J M"] | None,
-) -> Judged:
-    """What some episodes say of whoever acted in them; ``achieved`` is that of ``achieved_goals``."""
-    shares = None if achieved is None else jnp.mean(achieved, axis=0)
-    return Judged(returns.mean(), failed.sum(), shares)
-
-
-def achieved_goals(env: Environment, goals: Goals | Trajectory) -> Bool[Array, "M"] | None:
-    """Which of the world's M named goals an episode has achieved at its end; None without names."""
-    num = len(env.goal_names)
-    return hindsight_outcome(goals)[:num] > 0.5 if num else None
 
 
 class AdaptResult(NamedTuple):
@@ -187,11 +167,11 @@ def proceed(
     state, log = jax.lax.fori_loop(0, num_rounds + num_judged, body, (state, blank))
     judged = Judged(jnp.float32(jnp.nan), jnp.int32(0))
     if num_judged:
-        returns, failed, goals = jax.tree.map(
-            lambda rows: jax.lax.dynamic_slice_in_dim(rows[:, 0], num_rounds, num_judged),
-            (log.returns, log.failed, log.played.goals),
+        returns, failed = (
+            jax.lax.dynamic_slice_in_dim(rows[:, 0], num_rounds, num_judged)
+            for rows in (log.returns, log.failed)
         )
-        judged = judge(returns, failed, jax.vmap(partial(achieved_goals, env))(goals))
+        judged = Judged(returns.mean(), failed.sum())
     return state, jax.tree.map(lambda rows: rows[:max_rounds], log), judged
 
 

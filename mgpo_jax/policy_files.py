@@ -26,7 +26,7 @@ from envs.errors import DataError, UsageError, shown
 from envs.registry import World, find
 from mgpo_jax.claims import claimed, cleaned_on_exit
 from mgpo_jax.distributions import HEADS
-from mgpo_jax.encoders import ENCODERS, WITH_LAYOUT, layout_fault
+from mgpo_jax.encoders import ENCODERS
 from mgpo_jax.files import (
     PLACE,
     TEMPORARY,
@@ -255,20 +255,7 @@ def _fault(config: TransformerConfig) -> str | None:
     for name in ("obs_mean", "obs_std"):
         if len(getattr(config, name)) not in (0, size):
             return f"{name} must hold {size} numbers or none, found {len(getattr(config, name))}"
-    return _layout_fault(config)
-
-
-def _layout_fault(config: TransformerConfig) -> str | None:
-    """What is wrong with the layout of observations in a network's config."""
-    layout = config.obs_layout
-    if config.encoder not in WITH_LAYOUT:
-        return None if layout is None else f"obs_layout is of no use to encoder {config.encoder}"
-    if layout is None:
-        return f"obs_layout must not be null with encoder {config.encoder}"
-    if config.obs_mean:
-        return f"obs_mean must be empty with encoder {config.encoder}, whose codes are no amounts"
-    said = layout_fault(layout, config.obs_shape)
-    return said and f"obs_layout {said}"
+    return None
 
 
 def _check_blocks(path: Path, config: TransformerConfig) -> None:

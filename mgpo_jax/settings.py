@@ -37,8 +37,7 @@ BatchSize = Annotated[int, Ge(1), Le(65_536)]
 Width = Annotated[int, Ge(1), Le(16_384)]
 NumLayers = Annotated[int, Ge(1), Le(256)]
 
-TokensPerStep = Literal[2, 1]
-Encoder = Literal["linear", "cells"]
+Encoder = Literal["linear"]
 """The names in ``encoders.ENCODERS``, which need jax."""
 Head = Literal["categorical", "gaussian", "fixed_gaussian", "mixture", "binned"]
 """The names in ``distributions.HEADS``, which need jax."""
@@ -87,7 +86,7 @@ def check_values(settings_class: type, values: Mapping[str, Any]) -> None:
             continue
         choices = [part for part in get_parts(annotation) if get_origin(part) is Literal]
         if choices and isinstance(value, str):
-            raise nearest(value, list(map(str, get_args(choices[0]))), flag(name))
+            raise nearest(value, get_args(choices[0]), flag(name))
         raise UsageError(f"{flag(name)} {said}")
 
 
@@ -126,8 +125,7 @@ RECIPE_NETWORK: dict[str, Any] = {"dropout": 0.0, "num_heads": 4}
 """How the network of the general recipe differs from the paper's (Table 6)."""
 
 OF_WEIGHTS = (
-    "max_prompt_length", "prompt_order", "embed_dim", "num_layers", "num_heads", "encoder", "head",
-    "tokens_per_step",
+    "max_prompt_length", "prompt_order", "embed_dim", "num_layers", "num_heads", "encoder", "head"
 )  # fmt: skip
 """Settings of a network that its weights were made for; dropout is none, since it only trains."""
 

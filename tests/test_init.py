@@ -195,8 +195,7 @@ def test_a_released_policy_of_an_older_version_is_known_by_its_network() -> None
     assert initial_at(PRETRAINED / "kitchen") == (
         {
             "max_prompt_length": 6, "prompt_order": True, "embed_dim": 128, "num_layers": 3,
-            "num_heads": 4, "encoder": "linear", "head": "binned", "tokens_per_step": 2,
-            "standardize_obs": True,
+            "num_heads": 4, "encoder": "linear", "head": "binned", "standardize_obs": True,
         },
         hash_file(PRETRAINED / "kitchen/weights.npz"),
     )  # fmt: skip
@@ -212,8 +211,6 @@ CONTRADICTIONS = {
     "--max-prompt-length 5": f"--max-prompt-length 5 {POLICY} max_prompt_length 3;",
     "--prompt-order": f"--prompt-order {POLICY} prompt_order False;",
     "--no-standardize-obs": f"--no-standardize-obs {POLICY} standardize_obs True;",
-    "--tokens-per-step 1": f"--tokens-per-step 1 {POLICY} tokens_per_step 2;",
-    "--encoder cells": f"--encoder cells {POLICY} encoder linear;",
     "--head gaussian": f"--head gaussian {POLICY} head categorical;",
 }
 

@@ -38,7 +38,6 @@ from mgpo_jax.settings import (
     NumTrajectories,
     Seed,
     Share,
-    TokensPerStep,
     TrainConfig,
     Width,
     check_contradictions,
@@ -117,12 +116,8 @@ class PretrainConfig(Common):
     """Transformer blocks [3]."""
     num_heads: Width = RECIPE_NETWORK["num_heads"]
     """Attention heads, which share the width of the network evenly [1]."""
-    tokens_per_step: TokensPerStep = 2
-    """Tokens of a step: an observation and an action as 2, or the last action and the observation summed
-    as 1 [2]."""
     encoder: Encoder = "linear"
-    """How observations become tokens [linear]; ``cells`` is for worlds whose observations are codes and
-    counts."""
+    """How observations become tokens [linear]."""
     head: Head | None = None
     """Distribution of actions; continuous ones have all but categorical (default: that of the preset, else
     the first that fits) [fixed_gaussian in the authors' code]."""
@@ -131,7 +126,7 @@ class PretrainConfig(Common):
     holdout: NumTrajectories = 200
     """Trajectories kept out of training for the validation loss."""
     eval_tasks: NumTasks = 64
-    """Tasks of the evaluation on the way, an episode each (no test tasks)."""
+    """Tasks of the greedy evaluation on the way (no test tasks)."""
     eval_every: Count = 1_000
     """Steps between evaluations."""
     save_every: Count = 500
@@ -318,14 +313,10 @@ def check_pretraining(config: PretrainConfig) -> None:
         raise UsageError(
             f"--batch-size {train.batch_size} is not a multiple of --part-size {train.part_size}"
         )
-    if config.init is not None and not goes_on(config):
-        check_initial(config)
-    if config.standardize_obs and config.encoder != "linear":
-        raise UsageError(
-            f"--standardize-obs has no use with --encoder {config.encoder}, whose codes are no amounts; "
-            "leave it out"
-        )
-    if config.init is None and config.embed_dim % config.num_heads:
+    if config.init is not None:
+        if not goes_on(config):
+            check_initial(config)
+    elif config.embed_dim % config.num_heads:
         raise UsageError(
             f"--embed-dim {config.embed_dim} is not a multiple of --num-heads {config.num_heads}"
         )

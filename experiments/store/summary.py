@@ -20,8 +20,6 @@ from experiments.store.statistics import (
     Interval,
     PartShare,
     SeedSpread,
-    crafter_score,
-    gain_over_tasks,
     part_shares,
     seed_spread,
     stratified_bootstrap_iqm,
@@ -41,7 +39,6 @@ DECIDING = {
     "returns": ArrayField(("S", "N", "E"), "numbers"),
     "eval_episodes": ArrayField(("C",), "int64", low=1),
     "eval_returns": ArrayField(("S", "N", "C"), "numbers"),
-    "eval_achieved": ArrayField(("S", "N", "C", "M"), "numbers", required=False, low=0, high=1),
     "optimal_returns": ArrayField(("N",), "numbers", required=False),
     "num_parts": ArrayField(("N",), "integers", required=False, low=0),
 }
@@ -53,7 +50,6 @@ Tally = Annotated[int, Ge(0), Le(2**62)]
 Extent = Annotated[int, Ge(1), Le(2**62)]
 Amount = Annotated[float, Ge(0)]
 Fraction = Annotated[float, Ge(0), Le(1)]
-Shares = Annotated[dict[Label, Fraction], MinLen(1), MaxLen(1_000)]
 PartShares = Annotated[list[tuple[Fraction, Extent]], MinLen(1), MaxLen(MOST_PARTS)]
 
 
@@ -87,19 +83,6 @@ class Summary(TypedDict):
     is the mean of several episodes: only that mean is kept, which does not tell the parts of each."""
     failed_episodes: Tally
     best_episode_return: float
-    """Return of the best single episode of the search, a matter of luck in worlds of chance."""
-    sampled_episodes: NotRequired[Extent]
-    """In worlds whose policies are judged by sampled actions: the number of fresh episodes, outside of the
-    budget, that a judged return is the mean of."""
-    gain: NotRequired[float]
-    """There: ``final_return`` minus ``initial_return``, of the same tasks."""
-    gain_95: NotRequired[tuple[float, float] | None]
-    """Its interval over tasks (``statistics.gain_over_tasks``); None for one task."""
-    achieved: NotRequired[Shares]
-    """In worlds with named goals: the share of the judged episodes that achieved each under the optimized
-    prompt, by its name."""
-    achieved_initially: NotRequired[Shares]
-    """The same under the initial prompt."""
     cpu_seconds: Amount
     episodes_per_cpu_second: Amount
 
@@ -126,8 +109,6 @@ def summarize(
         **_of_judgements(results.eval_returns),
         **_against_optimum(results.eval_episodes, results.eval_returns, optimum, solvable),
         "part_shares": part_shares(final, results.num_parts) if single else None,
-        **_of_sampling(results),
-        **_of_named_goals(results),
         "failed_episodes": num_failed,
         "cpu_seconds": cpu_seconds,
         "episodes_per_cpu_second": num_episodes / cpu_seconds,
@@ -155,40 +136,6 @@ def _of_judgements(eval_returns: np.ndarray) -> dict[str, Any]:
         "final_return_iqm": iqm.value,
         "final_return_iqm_95": None if iqm.low is None else [iqm.low, iqm.high],
     }
-
-
-def _of_sampling(results: Results) -> dict[str, Any]:
-    """What worlds say beside it that judge by sampled actions."""
-    judged = results.world.judged
-    if judged.mode != "sample":
-        return {}
-    return {
-        "sampled_episodes": results.config.get("eval_episodes") or judged.episodes,
-        **_gain(results.eval_returns),
-    }
-
-
-def _gain(eval_returns: np.ndarray) -> dict[str, Any]:
-    """How much better the last of the judged returns [S, N, C] are than the first."""
-    gain = gain_over_tasks(eval_returns[:, :, -1], eval_returns[:, :, 0])
-    return {"gain": gain.value, "gain_95": None if gain.low is None else [gain.low, gain.high]}
-
-
-def _of_named_goals(results: Results) -> dict[str, dict[str, float]]:
-    """What worlds say beside it that have names for goals."""
-    if results.eval_achieved is None:
-        return {}
-    names = results.world.make().goal_names
-    first, last = (results.eval_achieved[:, :, i].mean(axis=(0, 1)).tolist() for i in (0, -1))
-    return {
-        "achieved": dict(zip(names, last, strict=True)),
-        "achieved_initially": dict(zip(names, first, strict=True)),
-    }
-
-
-def score_of(shares: Mapping[str, float]) -> float:
-    """The score of the shares of named goals (``statistics.crafter_score``)."""
-    return crafter_score(np.array(list(shares.values())))
 
 
 def judged_once(config: Mapping[str, Any], world: World | None) -> bool | None:
@@ -301,13 +248,6 @@ def check_against(path: Path, summary: Summary, single: bool | None) -> None:
         known = "num_parts" in arrays and single is not False
         shares = part_shares(judged[:, :, -1], arrays["num_parts"]) if known else None
         expected["part_shares"] = None if single is None and not found["part_shares"] else shares
-    if "gain" in found:
-        expected |= _gain(judged)
-    if "achieved" in found or "eval_achieved" in arrays:
-        of_goals = arrays.get("eval_achieved")
-        for name, index in (("achieved_initially", 0), ("achieved", -1)):
-            found[name] = list(found.get(name, {}).values()) or None
-            expected[name] = None if of_goals is None else of_goals[:, :, index].mean(axis=(0, 1))
     for name, value in expected.items():
         if not _agree(found[name], value):
             raise DataError(
@@ -327,41 +267,6 @@ def _told(value: Any) -> str:
     if value is None:
         return "unknown"
     return ", ".join(f"{part:.6g}" for part in np.ravel(value))
-
-
-def _rows_of_sampling(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What is printed beside it in worlds that judge by sampled actions."""
-    if "gain" not in summary:
-        return []
-    gain = Interval(summary["gain"], *(summary["gain_95"] or ()))
-    return [
-        (
-            "best single episode",
-            f"{summary['best_episode_return']:.3f} (of the search: luck included)",
-        ),
-        (
-            "fresh",
-            f"{summary['final_return']:.3f} (the final return, of {summary['sampled_episodes']} sampled "
-            "episodes outside of the search)",
-        ),
-        ("  minus initial", f"{gain}{' (95 % over tasks)' if gain.low is not None else ''}"),
-    ]
-
-
-def _rows_of_named_goals(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What is printed beside it in worlds with named goals."""
-    if not (last := summary.get("achieved")):
-        return []
-    first = summary["achieved_initially"]
-    share = [f"{100 * np.mean(list(shares.values())):.1f} %" for shares in (first, last)]
-    rows = [
-        ("score", f"{score_of(last):.2f} (initially {score_of(first):.2f})"),
-        ("goals achieved", f"{share[1]} of {len(last)} (initially {share[0]})"),
-    ]
-    return rows + [
-        (f"  {name}", f"{100 * last[name]:.1f} % (initially {100 * first[name]:.1f} %)")
-        for name in last
-    ]
 
 
 def printed(summary: Mapping[str, Any]) -> str:
@@ -386,7 +291,6 @@ def printed(summary: Mapping[str, Any]) -> str:
     if shares := summary.get("part_shares"):
         rows.append(("parts in order", "share with the first k done (tasks x seeds that have k)"))
         rows += [(f"  p{k}", str(PartShare(*pair))) for k, pair in enumerate(shares, 1)]
-    rows += _rows_of_sampling(summary) + _rows_of_named_goals(summary)
     if unsolvable := summary.get("unsolvable_tasks"):
         rows.append(
             (

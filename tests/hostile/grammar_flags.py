@@ -79,10 +79,6 @@ CONTRADICTIONS: dict[str, tuple[tuple[str, str], ...]] = {
         ("--init policy --no-prompt-order", "--no-prompt-order"),
         ("--init policy --standardize-obs", "--standardize-obs"),
         ("--init policy --env gridworld", "policy"),
-        ("--init policy --tokens-per-step 1", "--tokens-per-step"),
-        ("--encoder cells", "--encoder"),
-        ("--encoder cells --standardize-obs", "--standardize-obs"),
-        ("--tokens-per-step 3", "--tokens-per-step"),
         ("--init result", "result"),
     ),
     "adapt": (

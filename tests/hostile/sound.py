@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import fcntl
 import importlib
-import json
 import os
 import shutil
 from contextlib import chdir
-from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 
-from .grammar_npz import read
 from .work import EVALUATION, replaced
 
 NUM_TASKS = 2
@@ -21,7 +18,6 @@ PRETRAIN = (
     "--preset smoke --trajectories 40 --holdout 8 --embed-dim 8 --num-layers 1 --batch-size 8 "
     "--part-size 4 --bucket 64 --eval-tasks 2 --steps 4 --save-every 2 --eval-every 2 --out run"
 )
-COLLECT = "--trajectories 40"
 ADAPT = (
     "--policy policy --tasks tasks.npz --seeds 1 --episodes 4 --eval-every 2 --eval-episodes 1 "
     "--no-figures --out result"
@@ -53,25 +49,12 @@ def make(folder: Path) -> Path:
     return folder
 
 
-def _collect_with_noise() -> None:
-    """The dataset of the runs, as if its demonstrator had told what it intended."""
-    run("collect", COLLECT)
-    (folder,) = Path("data/maze15").iterdir()
-    path, manifest = folder / "trajectories.npz", folder / "manifest.json"
-    arrays = read(path)
-    np.savez_compressed(path, allow_pickle=False, **arrays, intended=arrays["actions"])
-    document = json.loads(manifest.read_text())
-    document["sha256"] = sha256(path.read_bytes()).hexdigest()
-    manifest.write_text(json.dumps(document))
-
-
 def _make() -> None:
     """Everything, in the current folder."""
     from mgpo_jax.tasks import test_tasks
     from mgpo_jax.trees import named_leaves
 
     os.environ.pop("MGPO_DATA", None)
-    _collect_with_noise()
     with replaced(EVALUATION):
         run("pretrain", PRETRAIN)
     shutil.copytree("run/policy", "policy")
