@@ -10,8 +10,7 @@ from typing import Any, NoReturn
 
 import tyro
 
-from envs.errors import UsageError
-from experiments.runtime import Common, refuse_existing_file, run, say
+from experiments.runtime import Common, refuse_existing_file, require_runs, run, say
 from experiments.signals import farewell
 from mgpo_jax.settings import Name
 
@@ -32,8 +31,7 @@ class CheckConfig(Common):
 
 def main(config: CheckConfig) -> None:
     """Act greedily under optimized prompts in a world and in its official program, and compare."""
-    if not config.runs:
-        raise UsageError("no result folder given; usage: python -m experiments.check RUN_DIR ...")
+    require_runs(config.runs, "check")
     if config.out:
         refuse_existing_file(config.out, "--out")
     from experiments.checking import HEAD, cells, compare, officials_of, summaries, told

@@ -10,8 +10,7 @@ from typing import Any, Literal, NoReturn
 
 import tyro
 
-from envs.errors import UsageError
-from experiments.runtime import Common, refuse_existing_file, run, say
+from experiments.runtime import Common, refuse_existing_file, require_runs, run, say
 from experiments.signals import farewell
 from mgpo_jax.settings import Name, NotNegative, NumEpisodes, Seed
 
@@ -41,10 +40,7 @@ class EvaluateConfig(Common):
 
 def main(config: EvaluateConfig) -> None:
     """Evaluate the optimized prompts of adaptations once more, under noise (Table 3) or elsewhere."""
-    if not config.runs:
-        raise UsageError(
-            "no result folder given; usage: python -m experiments.evaluate RUN_DIR ..."
-        )
+    require_runs(config.runs, "evaluate")
     if config.json:
         refuse_existing_file(config.json, "--json")
     from experiments.evaluation import HEAD, cells, evaluate_cases, noises, open_case

@@ -10,8 +10,7 @@ from typing import NoReturn
 import tyro
 
 import envs
-from envs.errors import UsageError
-from experiments.runtime import Common, run
+from experiments.runtime import Common, require_runs, run
 from mgpo_jax.claims import check_place
 from mgpo_jax.settings import Index, Name
 
@@ -36,8 +35,7 @@ class PlotConfig(Common):
 
 def main(config: PlotConfig) -> None:
     """Draw every figure that the results of some adaptations allow."""
-    if not config.runs:
-        raise UsageError("no result folder given; usage: python -m experiments.plot RUN_DIR ...")
+    require_runs(config.runs, "plot")
     check_place(config.out)
     if config.env is not None:
         envs.find(config.env)  # from now on results may name its place

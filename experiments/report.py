@@ -13,7 +13,7 @@ import tyro
 
 import envs
 from envs.errors import UsageError, printable
-from experiments.runtime import Common, run
+from experiments.runtime import Common, require_parent, require_runs, run
 from mgpo_jax.claims import check_place
 from mgpo_jax.settings import Name
 
@@ -32,8 +32,7 @@ class ReportConfig(Common):
 
 def main(config: ReportConfig) -> None:
     """Make one HTML page of adaptations: curves, all tasks, and every episode to step through."""
-    if not config.runs:
-        raise UsageError("no result folder given; usage: python -m experiments.report RUN_DIR ...")
+    require_runs(config.runs, "report")
     check_page(config.out)
     if config.env is not None:
         envs.find(config.env)  # from now on results may name its place
@@ -47,8 +46,7 @@ def check_page(out: Path) -> None:
     """Raise ``UsageError`` for a place where no page can be written, or where something else lies."""
     from experiments.store.seals import check_replaceable
 
-    if not out.absolute().parent.is_dir():
-        raise UsageError(f"--out {out}: there is no folder {out.parent}; make it first")
+    require_parent(out, "--out")
     if not os.path.lexists(out):
         check_place(out)
     if out.suffix != ".html":

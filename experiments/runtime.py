@@ -242,6 +242,14 @@ def _fail(message: str, code: int, debug: bool, prefix: str = "error: ") -> NoRe
     sys.exit(code)
 
 
+def require_runs(runs: Sequence[Path], command: str) -> None:
+    """Raise ``UsageError`` if a command was given no result folder."""
+    if not runs:
+        raise UsageError(
+            f"no result folder given; usage: python -m experiments.{command} RUN_DIR ..."
+        )
+
+
 def refuse_existing(folder: Path, *ways_out: str) -> None:
     """Raise ``UsageError`` with the ways out if an output exists, or if it could not be made."""
     if os.path.lexists(folder):
@@ -253,6 +261,11 @@ def refuse_existing_file(path: Path, named_by: str) -> None:
     """Raise ``UsageError`` if a file to be written exists, or if it could not be made."""
     if os.path.lexists(path):
         raise UsageError(f"{named_by} {path} exists already; remove it or choose another file")
+    require_parent(path, named_by)
+    check_place(path, named_by)
+
+
+def require_parent(path: Path, named_by: str) -> None:
+    """Raise ``UsageError`` if the folder in which a file is to be written does not exist."""
     if not path.name or not path.absolute().parent.is_dir():
         raise UsageError(f"{named_by} {path}: there is no folder {path.parent}; make it first")
-    check_place(path, named_by)

@@ -9,8 +9,7 @@ from typing import NoReturn
 
 import tyro
 
-from envs.errors import UsageError
-from experiments.runtime import Common, run, say
+from experiments.runtime import Common, require_runs, run, say
 
 
 @dataclass(frozen=True)
@@ -23,8 +22,7 @@ class TableConfig(Common):
 
 def main(config: TableConfig) -> None:
     """Print a Markdown table of adaptations, where it is fair beside the paper's Table 2."""
-    if not config.runs:
-        raise UsageError("no result folder given; usage: python -m experiments.table RUN_DIR ...")
+    require_runs(config.runs, "table")
     from experiments.store.rows import comparison, read_row
 
     say(comparison([read_row(folder) for folder in config.runs]))

@@ -89,7 +89,13 @@ def test_errors_in_the_decoder_are_found(maze: Greedy, right: str, wrong: str) -
 def test_many_whole_episodes_are_those_of_jax(name: str, num: int, prompts: int) -> None:
     world = envs.find(name)
     greedy = played(world, num, prompts)
-    check_parity(greedy, run_js(world, greedy.data))
+    found = run_js(world, greedy.data)
+    largest, same = differences(greedy, found)
+    steps = int(greedy.episodes.trajectory.length.sum())
+    print(
+        f"{name}: {len(same)} episodes, {steps} steps, {largest.max():.1e}, {sum(same)} same paths"
+    )
+    check_parity(greedy, found)
 
 
 def check_searches(world: World, which: list[int], num_episodes: int) -> None:

@@ -25,6 +25,7 @@ MOVES = ((0, -1), (-1, 0), (0, 1), (1, 0), (0, 0), (0, 0))
 SIDE = 10
 OBJECTS = ((9, 1), (8, 4), (1, 9), (3, 7), (3, 9), (6, 1), (8, 6))
 NUM_OBJECTS = len(OBJECTS)
+LETTERS = "ABCDEFG"  # their names
 MIN_SUBTASKS = 3
 NONE = -1  # fills an order of fewer than 7 objects
 

@@ -7,10 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from envs.base import Task
-from envs.gridworld.env import MIN_SUBTASKS, NONE, NUM_OBJECTS, OBJECTS, SIDE, GridWorld
+from envs.gridworld.env import LETTERS, MIN_SUBTASKS, NONE, NUM_OBJECTS, OBJECTS, SIDE, GridWorld
 from envs.page import Page
-
-LETTERS = "ABCDEFG"  # as in the pictures
 
 
 def grid_page(env: GridWorld) -> Page:

@@ -37,9 +37,8 @@ from envs.drawing.palette import (
 )
 from envs.drawing.pictures import Pictures, Shown, Stage, observations
 from envs.drawing.video import axes_in_a_row, write_gif
-from envs.gridworld.env import NONE, NUM_OBJECTS, OBJECTS, SIDE, GridWorld
+from envs.gridworld.env import LETTERS, NONE, NUM_OBJECTS, OBJECTS, SIDE, GridWorld
 
-LETTERS = "ABCDEFG"
 OBJECT_COLORS = (ORANGE, BLUE, GREEN, YELLOW, PURPLE, SKY, VERMILION)
 UNKNOWN = "?"  # a goal that names no single object
 NO_GOALS = "task goal only"
