@@ -12,6 +12,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
@@ -19,6 +20,9 @@ from types import FrameType
 SIGNALS = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGUSR1") if hasattr(signal, name)
 )
+
+MOMENT = 1.0
+"""Seconds that the main thread waits to be ended."""
 
 
 class Stopped(KeyboardInterrupt):
@@ -84,7 +88,7 @@ def watched() -> Iterator[None]:
     os.set_blocking(writing, False)
     # What the parent has told us to ignore, as a script does for its background jobs, stays ignored.
     heard = [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
-    before = {number: signal.signal(number, _nothing) for number in heard}
+    before = {number: signal.signal(number, _hold) for number in heard}
     pipe_before = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
     listener = threading.Thread(target=_listen, args=(reading,), daemon=True)
     listener.start()
@@ -101,8 +105,14 @@ def watched() -> Iterator[None]:
         _watch.forget()
 
 
-def _nothing(number: int, frame: FrameType | None) -> None:
-    """The listener does what has to be done."""
+def _hold(number: int, frame: FrameType | None) -> None:
+    """Keep the main thread from starting anything while the listener ends the process.
+
+    Otherwise it could make a file after the listener has looked whether there are any. The wait has an end
+    because the main thread may hold a lock that the listener needs.
+    """
+    if not _watch.patient:
+        time.sleep(MOMENT)
 
 
 def _listen(reading: int) -> None:
