@@ -1,12 +1,12 @@
-"""Measure speed in wall time on what jax finds: ``python -m tests.device.measure --help``.
+"""Measure speed in wall time on what jax finds: ``PYTHONPATH=tests python -m device.measure --help``.
 
 ``experiments.bench`` measures CPU time, which says little about a GPU. These are the figures of
 docs/speed.md, *On a GPU*; defaults are those of MazeRunner-15 there.
 
-    python -m tests.device.measure rates
-    python -m tests.device.measure adapt maze15
-    python -m tests.device.measure train maze15
-    python -m tests.device.measure physics 64 512 4096
+    PYTHONPATH=tests python -m device.measure rates
+    PYTHONPATH=tests python -m device.measure adapt maze15
+    PYTHONPATH=tests python -m device.measure train maze15
+    PYTHONPATH=tests python -m device.measure physics 64 512 4096
 
 Run one at a time and beside nothing else, since other work makes the figures worse. Compile times are
 those of an empty folder ``MGPO_CACHE``. ``kitchen-native`` needs ``JAX_PLATFORMS=cuda,cpu`` on a GPU.

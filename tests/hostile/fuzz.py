@@ -1,4 +1,6 @@
-"""The fuzz suite as a program: ``python -m tests.hostile.fuzz --cases 5000 --seed 0 --report report.md``.
+"""The fuzz suite as a program.
+
+    PYTHONPATH=tests python -m hostile.fuzz --cases 5000 --seed 0 --report report.md
 
 Runs cases of ``grammar.py`` one after another, and writes how many of them ended how, with the smallest
 example of each kind of bad end. ``--first 17 --cases 1`` repeats case 17 and prints all of it.

@@ -1,7 +1,7 @@
 """Whatever the command line and the files are, a command refuses them in one clear line or does its work.
 
-200 cases run always, 5,000 with ``--all``; ``python -m tests.hostile.fuzz --help`` says how to run others.
-The oracle is tested on commands that misbehave on purpose.
+200 cases run always, 5,000 with ``--all``; ``PYTHONPATH=tests python -m hostile.fuzz --help`` says how to
+run others. The oracle is tested on commands that misbehave on purpose.
 """
 
 from __future__ import annotations
@@ -41,9 +41,10 @@ def _fuzz(material: Path, tmp_path: Path, first: int, cases: int) -> None:
     """Cases in a process of their own, which is like that of a command."""
     where = tmp_path / "ended.json"
     words = ["--cases", cases, "--first", first, "--fuzz-seed", SEED, "--sound", material]
-    command = [sys.executable, "-m", "tests.hostile.fuzz", *map(str, words), "--json", str(where)]
+    command = [sys.executable, "-m", "hostile.fuzz", *map(str, words), "--json", str(where)]
     cache = str(material.parent / "cache")  # of compiled programs
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "MGPO_CACHE": cache}
+    path = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
+    environment = {**os.environ, "PYTHONPATH": path, "MGPO_CACHE": cache}
     environment.pop("XLA_FLAGS", None)
     done = subprocess.run(
         [*command, "--report", str(tmp_path / "report.md")],
