@@ -9,7 +9,7 @@ action, N tasks.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -58,6 +58,27 @@ class Box:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ObsLayout:
+    """What the numbers of a flat observation are, where they are not all amounts.
+
+    First come the codes of ``num_cells`` cells, then ``num_counts`` counts, then numbers. The code of a
+    cell is made of digits d_0, d_1, .. below ``code_sizes``: it is d_0 + code_sizes[0] * (d_1 +
+    code_sizes[1] * (d_2 + ..)), as of what lies in the cell and who stands there.
+
+    Attributes:
+      num_cells: number of cells.
+      code_sizes: how many values each digit of a code has; a single size is for codes without digits.
+      num_counts: number of counts.
+      max_count: the largest count; counts are integers from 0 on.
+    """
+
+    num_cells: int
+    code_sizes: tuple[int, ...]
+    num_counts: int
+    max_count: int
+
+
+@dataclass(frozen=True, kw_only=True)
 class EnvSpec:
     """Static facts of a world.
 
@@ -74,6 +95,7 @@ class EnvSpec:
         episode is only a sample of what a prompt is worth.
       reward_confirms_goals: whether a reward at a goal says that this goal was the right one at this
         point, as in worlds that reward a sequence part by part.
+      layout: what the numbers of an observation are, for encoders that embed codes and counts [amounts].
     """
 
     name: str
@@ -85,6 +107,7 @@ class EnvSpec:
     truncate_in_hindsight: bool = False
     deterministic: bool = True
     reward_confirms_goals: bool = False
+    layout: ObsLayout | None = None
 
     @property
     def discrete(self) -> bool:
@@ -158,6 +181,21 @@ class Trajectory(NamedTuple):
     goal_reached: Bool[Array, "*batch T"]
     outcomes: Float[Array, "*batch T G"]
     length: Int[Array, "*batch"]
+    intended: Array | None = None
+    """What the agent intended where it executed ``actions``, in their shape and dtype, for agents that
+    tell it (``Agent.intended``)."""
+
+    @property
+    def steps(self) -> dict[str, Any]:
+        """The arrays that have a row for every step, by name, without those that are None."""
+        rows = {name: rows for name, rows in self._asdict().items() if name != "length"}
+        return {name: array for name, array in rows.items() if array is not None}
+
+    @property
+    def labels(self) -> Any:
+        """What behavior cloning imitates: the intended actions, or the executed ones of an agent that
+        tells no others."""
+        return self.actions if self.intended is None else self.intended
 
     @property
     def goals(self) -> Goals:
@@ -229,6 +267,16 @@ class Environment:
         """
         del task
         return jnp.ones((), bool)
+
+    @property
+    def goal_names(self) -> tuple[str, ...]:
+        """Names of the first components of a goal, where each stands for something that an episode achieves
+        or not (default: none).
+
+        A component of an outcome above 1/2 means that this was achieved. Judged episodes are then counted
+        by what they achieved.
+        """
+        return ()
 
     def num_parts(self, task: Task) -> Int[Array, ""]:
         """The number n of parts of this task that pay 1/n each when they are done in order.
@@ -311,6 +359,12 @@ def _kind(dtype: np.dtype) -> str:
     return kinds.get(dtype.kind, str(dtype))
 
 
+def keeps_its_size(memory: Any, num_steps: int) -> Any:
+    """The memory of an agent that needs no more room as an episode goes on."""
+    del num_steps
+    return memory
+
+
 class Agent(NamedTuple):
     """Whoever acts in an episode: a policy with its prompt, or a demonstrator of a dataset.
 
@@ -322,12 +376,17 @@ class Agent(NamedTuple):
     """``(key, task, state, timestep)`` at the start of an episode."""
     proceed: Callable
     """``(key, memory, state, timestep)`` after every step."""
-    grow: Callable = lambda memory, num_steps: memory
+    grow: Callable = keeps_its_size
     """``(memory, num_steps) -> memory`` with room for that many more steps."""
     decisions: Callable = lambda memory: ()
     """``(memory) -> decisions``: what it decided in the episode beside its actions, for agents whose
     decisions last several steps. It is asked when all episodes of a batch have ended, and until then an
     agent acts on: keep decisions by the step they were made in, of which the first ``length`` count."""
+    intended: Callable[[Any], Array] | None = None
+    """``(memory) -> action`` that the agent intended in its latest ``begin`` or ``proceed``, in the shape
+    and dtype of the action that it executed. A demonstrator that executes other actions now and then,
+    such as random ones, defines it: what was executed is the history that a policy reads, and what was
+    intended is what it imitates (default: the agent executes what it intends, and nothing is kept)."""
 
 
 class Demonstrator(NamedTuple):
@@ -346,6 +405,9 @@ class Demonstrator(NamedTuple):
     """Arrays that the agent is made from, such as the weights of a network; they enter programs as data."""
     settings: tuple[tuple[str, float], ...] = ()
     """Names and values of what else its data depends on; a dataset made with others is out of date."""
+    configured: Callable[[Mapping[str, float]], Demonstrator] | None = None
+    """``(values) -> demonstrator`` with some of its settings changed; raises ``ValueError`` for a value out
+    of range. None where they are fixed."""
     env: Environment | None = None
     """The world that it demonstrates in, where that is another one than the world it is asked for. Both
     have the same observations, goals and actions, and equal tasks have equal fingerprints."""

@@ -13,7 +13,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PRNGKeyArray
 
-from envs.base import Agent, Environment, Episode, State, Task, TimeStep, Trajectory
+from envs.base import (
+    Agent,
+    Environment,
+    Episode,
+    State,
+    Task,
+    TimeStep,
+    Trajectory,
+    keeps_its_size,
+)
 
 # The loop runs in segments, between which the agent's memory grows. More segments make a step cost what
 # has been seen rather than the horizon, and take longer to compile.
@@ -32,15 +41,15 @@ def segment_length(horizon: int) -> int:
 
 
 @jax.custom_batching.custom_vmap
-def _anyone(alive: Bool[Array, ""]) -> Bool[Array, ""]:
+def anyone(alive: Bool[Array, ""]) -> Bool[Array, ""]:
     """Whether this episode, or under ``vmap`` any of the batch, is still running."""
     return alive
 
 
-@_anyone.def_vmap
+@anyone.def_vmap
 def _anyone_of_batch(size: int, batched: Any, alive: Bool[Array, "B"]) -> tuple[Array, bool]:
     del size, batched
-    return _anyone(jnp.any(alive)), False
+    return anyone(jnp.any(alive)), False
 
 
 class _Loop(NamedTuple):
@@ -79,20 +88,21 @@ def run_episode(key: PRNGKeyArray, env: Environment, agent: Agent, task: Task) -
         state=state,
         timestep=timestep,
         memory=memory,
-        trajectory=_blank(horizon, action, timestep),
+        trajectory=_blank(horizon, action, timestep, _intended(agent, memory)),
         rewards=jnp.zeros(horizon),
         return_=jnp.zeros(()),
         last_obs=timestep.obs,
         failed=jnp.asarray(timestep.failed),
     )
-    loop = _act(env, loop, action)
+    loop = _act(env, agent, loop, action)
 
     def advance(loop: _Loop) -> _Loop:
         step_key = jax.random.fold_in(key_steps, loop.time)
         action, quits, memory = agent.proceed(step_key, loop.memory, loop.state, loop.timestep)
-        return _act(env, loop._replace(alive=loop.alive & ~quits, memory=memory), action)
+        return _act(env, agent, loop._replace(alive=loop.alive & ~quits, memory=memory), action)
 
-    segment = segment_length(horizon)
+    # A memory of one size needs one segment, which compiles in a fraction of the time.
+    segment = horizon if agent.grow is keeps_its_size else segment_length(horizon)
     for start in range(1, horizon, segment):
         end = min(start + segment, horizon)
         loop = loop._replace(memory=agent.grow(loop.memory, end - start))
@@ -129,7 +139,12 @@ def replay(
     return run_episode(key, env, Agent(begin, proceed), task)
 
 
-def _blank(horizon: int, action: Array, timestep: TimeStep) -> Trajectory:
+def _intended(agent: Agent, memory: Any) -> Array | None:
+    """What an agent intended in its latest action; None for an agent that does not tell it."""
+    return None if agent.intended is None else agent.intended(memory)
+
+
+def _blank(horizon: int, action: Array, timestep: TimeStep, intended: Array | None) -> Trajectory:
     """A trajectory of no steps with room for ``horizon``."""
 
     def rows(row: Array) -> Array:
@@ -142,23 +157,24 @@ def _blank(horizon: int, action: Array, timestep: TimeStep) -> Trajectory:
         goal_reached=jnp.zeros(horizon, bool),
         outcomes=rows(timestep.outcome),
         length=jnp.zeros((), jnp.int32),
+        intended=None if intended is None else rows(action),
     )
 
 
-def _act(env: Environment, loop: _Loop, action: Array) -> _Loop:
+def _act(env: Environment, agent: Agent, loop: _Loop, action: Array) -> _Loop:
     """Take one action and record what came of it, unless the episode has ended."""
     alive = loop.alive
 
-    def put(rows: Array, row: Array) -> Array:
+    def put(rows: Any, row: Array) -> Array:
         row = jnp.where(alive, row, 0).astype(rows.dtype)
         return jax.lax.dynamic_update_index_in_dim(rows, row, loop.time, 0)
 
     state, timestep = env.step(loop.state, action)
-    record = loop.trajectory
+    record, intended = loop.trajectory, _intended(agent, loop.memory)
     goes_on = alive & ~timestep.terminated & ~timestep.truncated
     return _Loop(
         time=loop.time + 1,
-        anyone_alive=_anyone(goes_on),
+        anyone_alive=anyone(goes_on),
         alive=goes_on,
         state=state,
         timestep=timestep,
@@ -170,6 +186,7 @@ def _act(env: Environment, loop: _Loop, action: Array) -> _Loop:
             goal_reached=put(record.goal_reached, timestep.goal_reached),
             outcomes=put(record.outcomes, timestep.outcome),
             length=record.length + alive,
+            intended=None if intended is None else put(record.intended, intended),
         ),
         rewards=put(loop.rewards, timestep.reward),
         # Summed step by step: equal rewards make equal returns, whenever they came.

@@ -24,6 +24,10 @@ class NotAvailableError(UsageError):
     """A world does not offer something that is optional, such as goals drawn at random."""
 
 
+class MissingExtraError(ImportError):
+    """Packages that a world needs are missing, too old, incomplete or do not fit together."""
+
+
 def nearest(name: str, known: Iterable[str], what: str) -> UsageError:
     """The error for an unknown name, with the nearest known one."""
     known = list(known)

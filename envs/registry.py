@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 from envs.errors import DataError, UsageError, nearest, printable, shown
 
 if TYPE_CHECKING:
-    from envs.base import Demonstrator, Environment
+    from envs.base import Demonstrator, Environment, ObsLayout
     from envs.drawing import Pictures
     from envs.official import Official
     from envs.page import Page
@@ -73,6 +73,8 @@ class World:
       page: what the world brings to HTML pages; None shows what needs nothing of it.
       policy_of: the world whose released policy and test tasks this one uses [its own].
       judged: how policies are judged here; every table follows it.
+      method_defaults: what the world changes in the default hyper-parameters of methods, by the name of the
+        method, such as the unit of returns in which a bandit counts.
       num_test_tasks: how many tasks are kept for test.
       official: the program by others that this world re-implements, to compare it with [none].
     """
@@ -86,6 +88,7 @@ class World:
     page: Callable[[Any], Page] | None = None
     policy_of: str | None = None
     judged: Judgement = field(default_factory=Judgement)
+    method_defaults: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     num_test_tasks: int = 50
     official: Callable[[Any], Official] | None = None
 
@@ -93,6 +96,27 @@ class World:
     def home(self) -> str:
         """The name under which its released policy, test tasks, datasets and paper numbers are kept."""
         return self.policy_of or self.name
+
+
+@dataclass(frozen=True, kw_only=True)
+class Encoder:
+    """How a network turns an observation into a token.
+
+    Attributes:
+      name: what ``--encoder`` calls it.
+      make: ``(shape of an observation, width of a token, layout of an observation) -> module``. The module
+        (Flax) maps observations ``[*batch, ...]`` to tokens ``[*batch, E]``. The layout is None unless
+        ``uses_layout``.
+      uses_layout: whether it asks for the layout of observations (``EnvSpec.layout``). What is coded is no
+        amount: such observations are not standardized and get no noise.
+      fault: ``(layout, shape) -> text``, what is wrong with observations of this layout and shape, as the
+        end of a sentence about the layout; None if nothing is.
+    """
+
+    name: str
+    make: Callable[[tuple[int, ...], int, ObsLayout | None], Any]
+    uses_layout: bool = False
+    fault: Callable[[ObsLayout, tuple[int, ...]], str | None] = lambda layout, shape: None
 
 
 Record = TypeVar("Record")
@@ -218,8 +242,14 @@ WORLDS: Registry[World] = Registry(
         "kitchen-mjx": "envs.kitchen:KITCHEN_MJX",
         "kitchen-native": "envs.kitchen:KITCHEN_NATIVE",
         "kitchen-stock": "envs.kitchen:KITCHEN_STOCK",
+        "crafter": "envs.crafter:CRAFTER",
+        "crafter-map": "envs.crafter:CRAFTER_MAP",
+        "crafter-symbolic": "envs.crafter:CRAFTER_SYMBOLIC",
     },
 )
+
+ENCODER_PLACES = {"crafter-picture": "envs.crafter:PICTURE"}
+"""The encoders that worlds bring, by name: the places of their records."""
 
 
 def register(world: World) -> World:

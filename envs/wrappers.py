@@ -42,6 +42,10 @@ class Wrapper(Environment):
     def solvable(self, task: Task) -> Bool[Array, ""]:
         return self.env.solvable(task)
 
+    @property
+    def goal_names(self) -> tuple[str, ...]:
+        return self.env.goal_names
+
     def num_parts(self, task: Task) -> Int[Array, ""]:
         return self.env.num_parts(task)
 
@@ -104,6 +108,10 @@ class Noisy(Wrapper):
             raise ValueError(
                 f"noise on observations needs floating-point observations, those of "
                 f"{self.env.spec.name} are {self.env.spec.obs}"
+            )
+        if (self.obs_noise or any(self.obs_range)) and self.env.spec.layout is not None:
+            raise ValueError(
+                f"noise on observations needs amounts, those of {self.env.spec.name} are codes and counts"
             )
 
     def _range_told(self) -> str:

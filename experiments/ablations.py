@@ -36,7 +36,7 @@ from experiments.store.work import open_journal
 from experiments.training import train
 from mgpo_jax.claims import claimed
 from mgpo_jax.distributions import HEADS
-from mgpo_jax.methods import UcbHyper
+from mgpo_jax.methods import UCB, UcbHyper
 from mgpo_jax.policy_files import load_policy
 from mgpo_jax.tasks import test_tasks
 
@@ -126,9 +126,10 @@ def adapted(
 
 def table4(config: ReproduceConfig) -> list[Line]:
     """Longest prompt K and exploration constant c, with the released policy (Table 4)."""
-    folder = config.folder / "table4"
+    folder, world = config.folder / "table4", envs.find(config.env)
     lengths = {
-        folder / f"K{k}-{config.seeds}seeds": UcbHyper(max_goals=k) for k in (1, 2, 3, LONGEST)
+        folder / f"K{k}-{config.seeds}seeds": UCB.hyper_in(world, {"max_goals": k})
+        for k in (1, 2, 3, LONGEST)
     }
     constants = {  # Eq. 3 as printed
         folder / f"c{c}-{config.seeds}seeds": UcbHyper(c=float(c), max_goals=LONGEST, scale=1.0)
@@ -138,8 +139,7 @@ def table4(config: ReproduceConfig) -> list[Line]:
     adapted(config, None, constants)
     lines = [(f"K = {hyper.max_goals}", path) for path, hyper in lengths.items()]
     lines += [(f"c = {hyper.c:.0f}", path) for path, hyper in constants.items()]
-    home = envs.find(config.env).home
-    return [Line(label, path, paper_value("table4", home, label)) for label, path in lines]
+    return [Line(label, path, paper_value("table4", world.home, label)) for label, path in lines]
 
 
 def chosen(config: ReproduceConfig, names: Sequence[str]) -> Sequence[str]:
@@ -161,7 +161,7 @@ def compared(
     for name in chosen(config, names):
         policy = policy_of(name)
         results = config.folder / config.what / f"{policy.parent.name}-{config.seeds}seeds"
-        adapted(config, policy, {results: UcbHyper()})
+        adapted(config, policy, {results: UCB.hyper_in(envs.find(config.env))})
         paper = paper_value(config.what, envs.find(config.env).home, name)
         lines.append(Line(label.format(name), results, paper))
     return lines

@@ -18,14 +18,14 @@ from mgpo_jax.settings import flag
 
 
 def adapt_default(config: AdaptConfig, flags: Iterable[str] = ()) -> AdaptConfig:
-    """The defaults, with the hyper-parameters of the method that a config names.
+    """The defaults, with the hyper-parameters of the method that a config names in its world.
 
     Args:
       config: settings without hyper-parameters.
       flags: what else the command line gives.
 
     Raises:
-      UsageError: for a flag that belongs to another method.
+      UsageError: for a flag that belongs to another method, or a world or method that does not exist.
     """
     method = methods.find(config.method)
     own = {field.name for field in dataclasses.fields(method.hyper)}
@@ -33,7 +33,8 @@ def adapt_default(config: AdaptConfig, flags: Iterable[str] = ()) -> AdaptConfig
     for name in sorted(others - own):
         if not {flag(name), flag(f"no_{name}")}.isdisjoint(flags):
             raise foreign_setting(name, method)
-    return AdaptConfig(method=config.method, hyper=method.hyper())
+    hyper = method.hyper_in(envs.find(config.env))
+    return AdaptConfig(method=config.method, hyper=hyper)
 
 
 def main(config: AdaptConfig) -> None:

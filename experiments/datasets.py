@@ -6,7 +6,7 @@ import os
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
@@ -22,14 +22,14 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 import envs
 from envs.base import Demonstrator, Environment, Episode
 from envs.episodes import run_episode
-from envs.errors import DataError, UsageError, nearest
+from envs.errors import DataError, UsageError, nearest, shown
 from envs.registry import World
 from experiments.runtime import refuse_existing
 from experiments.store.provenance import provenance, versions
 from experiments.store.settings import CollectConfig, PretrainConfig, dataset_folder
 from experiments.store.work import PIECES, long_work
 from mgpo_jax.claims import check_place
-from mgpo_jax.dataset import STEP_ARRAYS, Dataset, hash_task, load_dataset, write_dataset
+from mgpo_jax.dataset import Dataset, hash_task, load_dataset, write_dataset
 from mgpo_jax.files import ExistsError, remove_leftovers
 from mgpo_jax.journal import Journal
 from mgpo_jax.progress import Progress
@@ -43,10 +43,15 @@ BATCH = 250  # episodes at once: enough to fill the vector units, few enough to 
 
 
 def find_demonstrator(world: World, env: Environment, name: str | None) -> tuple[str, Demonstrator]:
-    """The demonstrator of that name; the world's first for None.
+    """The demonstrator of that name and its name; the world's first for None.
+
+    Args:
+      world: whose demonstrator it is.
+      env: the world, made.
+      name: its name, followed by settings to change, as in ``expert,drop=0.3,shuffle=1``.
 
     Raises:
-      UsageError: if the world has none, or none of that name.
+      UsageError: if the world has none, or none of that name or with such a setting.
     """
     known = world.demonstrators(env)
     if not known:
@@ -54,10 +59,41 @@ def find_demonstrator(world: World, env: Environment, name: str | None) -> tuple
             f"{world.name} has no demonstrators, so no dataset can be collected; train on one of your own "
             "with mgpo_jax.pretrain"
         )
-    name = name or next(iter(known))
+    name, *changes = (name or next(iter(known))).split(",")
     if name not in known:
         raise nearest(name, known, "demonstrator")
-    return name, known[name]
+    return _configured(name, known[name], changes) if changes else (name, known[name])
+
+
+def _configured(
+    name: str, demonstrator: Demonstrator, changes: Sequence[str]
+) -> tuple[str, Demonstrator]:
+    """A demonstrator with changed settings, written as ``name=number``, and its name with them in order."""
+    if demonstrator.configured is None:
+        raise UsageError(
+            f"the demonstrator {name} has no settings to change; leave out {changes[0]!r}"
+        )
+    known, values = dict(demonstrator.settings), {}
+    for change in changes:
+        setting, _, text = change.partition("=")
+        if setting not in known:
+            raise nearest(setting, known, f"setting of the demonstrator {name}")
+        if setting in values:
+            raise UsageError(f"the setting {setting} of the demonstrator {name} is given twice")
+        try:
+            values[setting] = float(text)
+        except ValueError:
+            raise UsageError(
+                f"the setting {setting} of the demonstrator {name} must be a number, found {shown(text)}; "
+                f"write it as {setting}={known[setting]:g}"
+            ) from None
+    values = {setting: value for setting, value in values.items() if value != known[setting]}
+    try:
+        changed = demonstrator.configured(values)
+    except ValueError as error:
+        raise UsageError(f"demonstrator {name}: {error}") from None
+    written = [f"{setting}={values[setting]:.12g}" for setting in sorted(values)]
+    return ",".join([name, *written]), changed
 
 
 class Demonstration(NamedTuple):
@@ -133,7 +169,7 @@ def _rows(found: Demonstration, hashes: np.ndarray, rows: np.ndarray) -> dict[st
     """What a dataset keeps of some demonstrations."""
     episode, trajectory = found.episode, found.episode.trajectory
     real = np.arange(trajectory.goal_reached.shape[1]) < trajectory.length[rows, None]
-    steps = {name: np.asarray(getattr(trajectory, name))[rows][real] for name in STEP_ARRAYS}
+    steps = {name: np.asarray(array)[rows][real] for name, array in trajectory.steps.items()}
     return {
         **steps,
         "lengths": trajectory.length[rows],

@@ -43,7 +43,14 @@ def main(config: EvaluateConfig) -> None:
     require_runs(config.runs, "evaluate")
     if config.json:
         refuse_existing_file(config.json, "--json")
-    from experiments.evaluation import HEAD, cells, evaluate_cases, noises, open_case
+    from experiments.evaluation import (
+        HEAD,
+        achieved_table,
+        cells,
+        evaluate_cases,
+        noises,
+        open_case,
+    )
     from experiments.store.provenance import provenance
     from experiments.store.tables import table
     from mgpo_jax.files import write_json
@@ -63,6 +70,8 @@ def main(config: EvaluateConfig) -> None:
         for row in evaluate_cases(cases, config.episodes, config.seed):
             rows.append(row)
     say(table(HEAD, [cells(row) for row in rows]))
+    if goals := achieved_table(rows):
+        say(goals)
     if num_failed := sum(row["failed_episodes"] for row in rows):
         total = sum(row["num_episodes"] for row in rows)
         say(f"{num_failed} of {total} episodes ended because the world broke down")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 
 import envs
 from envs.base import Environment, Task
@@ -17,12 +18,13 @@ from envs.wrappers import Noisy
 from experiments.store.layout import TASKS
 from experiments.store.policies import load_policy_of
 from experiments.store.results import Results, load_results
-from experiments.store.statistics import SeedSpread, seed_spread
+from experiments.store.statistics import SeedSpread, mean_log_success, seed_spread
+from experiments.store.tables import table
 from mgpo_jax.optimizers.methods import judged_query
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.progress import Progress
 from mgpo_jax.prompts import Prompt
-from mgpo_jax.runner import evaluate
+from mgpo_jax.runner import evaluate_fully
 from mgpo_jax.tasks import tasks_from
 
 OFFICIAL: Literal["official"] = "official"
@@ -170,9 +172,8 @@ def _evaluate_case(case: Case, episodes: int, seed: int) -> Iterator[dict[str, A
     queries = judged_query(Prompt(*parts), case.world.judged)
     before = seed_spread(result.eval_returns[last])
     for noise, env in case.behind:
-        returns, num_failed = evaluate(
-            env, case.policy, case.tasks, queries, episodes=episodes, seed=seed
-        )
+        judged = evaluate_fully(env, case.policy, case.tasks, queries, episodes=episodes, seed=seed)
+        returns, num_failed = np.asarray(judged.return_), int(judged.num_failed.sum())
         now = seed_spread(returns)
         yield {
             "folder": str(case.folder),
@@ -190,7 +191,29 @@ def _evaluate_case(case: Case, episodes: int, seed: int) -> Iterator[dict[str, A
             "change": now.mean - before.mean,
             "failed_episodes": num_failed,
             "num_episodes": returns.size * episodes,
+            **_of_named_goals(env, judged.achieved),
         }
+
+
+def _of_named_goals(env: Environment, achieved: Any) -> dict[str, Any]:
+    """The entries of a row on named goals, from shares ``[S, N, M]``; none in worlds without names."""
+    if achieved is None:
+        return {}
+    shares = dict(zip(env.goal_names, achieved.mean(axis=(0, 1)).tolist(), strict=True))
+    return {"score": mean_log_success(list(shares.values())), "achieved": shares}
+
+
+def achieved_table(rows: Sequence[dict[str, Any]]) -> str:
+    """Score and share of episodes for each named goal, a column for each row that has them; or nothing."""
+    having = [row for row in rows if "achieved" in row]
+    if not having:
+        return ""
+    names = list(dict.fromkeys(name for row in having for name in row["achieved"]))
+    lines = [["score", *(f"{row['score']:.2f}" for row in having)]]
+    for name in names:
+        shares = (row["achieved"].get(name) for row in having)
+        lines.append([name, *("" if share is None else f"{100 * share:.1f} %" for share in shares)])
+    return table(("goal", *(f"{row['folder']}, noise {row['noise']}" for row in having)), lines)
 
 
 HEAD = (

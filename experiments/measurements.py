@@ -90,9 +90,11 @@ def sequence_flops(
     all tokens and the rest only where an action is read out, and attention its visible part.
     """
     width, steps = config.embed_dim, num_steps.astype(np.float64)
-    tokens = num_goals + 2 * steps - 1
+    each = config.tokens_per_step
+    tokens = num_goals + each * steps - (each - 1)
     full_layer = 24 * width**2 * tokens + 2 * width * tokens * (tokens + 1)
-    visible = steps * num_goals + steps**2  # keys visible from the observations
+    # Keys visible from the observations: the prompt's, and those of the steps so far.
+    visible = steps * num_goals + steps * (each * (steps - 1) / 2 + 1)
     last_layer = 4 * width**2 * tokens + 20 * width**2 * steps + 4 * width * visible
     obs_size = np.prod(config.obs_shape)
     ends = 2 * width * (obs_size + 2 * config.action_dim) * steps

@@ -259,10 +259,11 @@ def _choice(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
     if info.type_origin is not Literal:
         return None
     choices = get_args(info.type)
+    by_word = {str(choice): choice for choice in choices}
     return PrimitiveConstructorSpec(
         nargs=1,
         metavar="{" + ",".join(map(str, choices)) + "}",
-        instance_from_str=lambda words: words[0],
+        instance_from_str=lambda words: by_word.get(words[0], words[0]),
         is_instance=lambda value: value in choices,
         str_from_instance=lambda value: [str(value)],
     )

@@ -9,7 +9,6 @@ from dataclasses import fields, replace
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
@@ -34,11 +33,12 @@ from mgpo_jax.checkpoint import Snapshot, checkpoints, restore_state, save_state
 from mgpo_jax.claims import claimed
 from mgpo_jax.dataset import BatchPlan, Dataset
 from mgpo_jax.files import remove_unfinished, to_json, written
+from mgpo_jax.optimizers.methods import judged_query
 from mgpo_jax.policy import LoadedPolicy, transformer_policy
 from mgpo_jax.policy_files import MEND, read_policy, save_policy
 from mgpo_jax.progress import Progress
 from mgpo_jax.prompts import Prompt, sample_prompt, single_goal
-from mgpo_jax.rollout import Query, rollout
+from mgpo_jax.rollout import rollout
 from mgpo_jax.runner import together
 from mgpo_jax.sharding import device_mesh, largest_divisor
 from mgpo_jax.tasks import EVAL_SEED, evaluation_tasks
@@ -84,8 +84,10 @@ def configured_network(
     return replace(network, obs_mean=tuple(mean.tolist()), obs_std=tuple(std.tolist()))
 
 
-class GreedyEvaluation:
-    """Mean greedy returns on tasks of its own, none of them a test task, where the data were collected.
+class ReturnsOnTheWay:
+    """Mean returns on tasks of its own, none of them a test task, where the data were collected.
+
+    The policy acts as the world judges, greedily unless its record says otherwise, in one episode a task.
 
     ``initial`` is the return of the prompt (g^M); ``followed`` that of a prompt drawn from a perfect
     demonstration of the task, which says how well the policy does what a good prompt tells it. The latter
@@ -121,19 +123,23 @@ class GreedyEvaluation:
             prompt = sample_prompt(key_prompt, goals, place.task_goal(task), num_slots, kept=kept)
             return prompt, episode.return_
 
-        def greedy_return(params: Any, key: PRNGKeyArray, task: Task, prompt: Prompt) -> Array:
+        def judged_return(params: Any, key: PRNGKeyArray, task: Task, prompt: Prompt) -> Array:
             policy = transformer_policy(network, params)
-            return rollout(key, place, policy, task, Query(prompt, jnp.ones((), bool))).return_
+            return rollout(key, place, policy, task, judged_query(prompt, world.judged)).return_
 
-        self._returns = together(place, greedy_return, in_axes=(None, 0, 0, 0))
+        self._returns = together(place, judged_return, in_axes=(None, 0, 0, 0))
         self._initial = jax.vmap(lambda task: single_goal(place.task_goal(task), num_slots))(
             self.tasks
         )
-        demonstrate = together(place, demonstrated, in_axes=(0, 0, 0, None))
-        self._followed, returns = demonstrate(
-            self.keys[0], self.keys[1], self.tasks, demonstrator.weights
-        )
-        self._perfect = np.asarray(returns > self.optimum - PERFECT)
+        self._perfect = np.zeros(num, bool)
+        if np.isfinite(
+            self.optimum
+        ).all():  # elsewhere nobody knows which demonstrations are perfect
+            demonstrate = together(place, demonstrated, in_axes=(0, 0, 0, None))
+            self._followed, returns = demonstrate(
+                self.keys[0], self.keys[1], self.tasks, demonstrator.weights
+            )
+            self._perfect = np.asarray(returns > self.optimum - PERFECT)
 
     def __call__(self, params: Any) -> dict[str, float]:
         """The numbers for some weights."""
@@ -176,7 +182,9 @@ class Run:
         self.truncate = env.spec.truncate_in_hindsight
         self._held_out_parts = self._validation_parts(held_out, env.spec.horizon)
         _, demonstrator = find_demonstrator(world, env, config.data.demonstrator)
-        self._greedy = GreedyEvaluation(world, env, self.network, demonstrator, config.eval_tasks)
+        self._returns_on_the_way = ReturnsOnTheWay(
+            world, env, self.network, demonstrator, config.eval_tasks
+        )
         self.identity = runs.identity(config, sha256, init.sha256 if init else "")
         meta = {**meta, "dataset": str(place), "dataset_sha256": sha256, **self.origin}
         if runs.has_begun(self.folder):
@@ -202,13 +210,16 @@ class Run:
         return next(batch_stream(plan, held_out, self.truncate))
 
     def measure(self, state: TrainState) -> dict[str, float]:
-        """Losses on held-out trajectories and greedy returns.
+        """Losses on held-out trajectories and returns.
 
         Raises:
           DataError: if one of them is not finite.
         """
         held = self.trainer.evaluate(state.params, self._held_out_parts, self._held_out)
-        found = {**{f"val/{k}": v for k, v in held.items()}, **self._greedy(state.params)}
+        found = {
+            **{f"val/{k}": v for k, v in held.items()},
+            **self._returns_on_the_way(state.params),
+        }
         for name, value in found.items():
             if not np.isfinite(value):
                 raise diverged(state.step, name, value)

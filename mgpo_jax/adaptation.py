@@ -6,14 +6,16 @@ Everything here is for one task; callers ``vmap`` over tasks and seeds.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, Shaped
 
-from envs.base import Agent, Environment, EnvSpec, Episode, Goals, Task
+from envs.base import Agent, Environment, EnvSpec, Episode, Goals, Task, Trajectory
 from envs.episodes import run_episode
+from mgpo_jax.prompts import hindsight_outcome
 from mgpo_jax.trees import choose, put_row
 
 
@@ -81,6 +83,27 @@ class Judged(NamedTuple):
     """Mean return."""
     num_failed: Int[Array, "*batch"]
     """How many episodes ended because the world broke down."""
+    achieved: Float[Array, "*batch M"] | None = None
+    """Share of the episodes that achieved each of the world's M named goals; None in worlds without any."""
+
+
+def judge(
+    returns: Float[Array, "J"],
+    failed: Bool[Array, "J"],
+    achieved: Bool[Array, "J M"] | None,
+) -> Judged:
+    """Mean return, number of failed episodes, and share that achieved each named goal, of J episodes.
+
+    ``achieved`` is that of ``achieved_goals``.
+    """
+    shares = None if achieved is None else jnp.mean(achieved, axis=0)
+    return Judged(returns.mean(), failed.sum(), shares)
+
+
+def achieved_goals(env: Environment, goals: Goals | Trajectory) -> Bool[Array, "M"] | None:
+    """Which of the world's M named goals an episode has achieved at its end; None without names."""
+    num = len(env.goal_names)
+    return hindsight_outcome(goals)[:num] > 0.5 if num else None
 
 
 class AdaptResult(NamedTuple):
@@ -153,8 +176,8 @@ def proceed(
     @jax.jit  # traced once: for the shapes of the log, and in the loop
     def entry(state: AdaptState, index: Array) -> tuple[AdaptState, AdaptLog]:
         searching = jnp.ones((), bool) if judge_keys is None else index < num_rounds
-        judge = None if judge_keys is None else judge_keys[jnp.maximum(index - num_rounds, 0)]
-        return _round(state, env, adapter, task, searching, judge, keep_actions)
+        own_key = None if judge_keys is None else judge_keys[jnp.maximum(index - num_rounds, 0)]
+        return _round(state, env, adapter, task, searching, own_key, keep_actions)
 
     shapes = jax.eval_shape(entry, state, jnp.int32(0))[1]
     size = max_rounds + num_judged
@@ -167,11 +190,11 @@ def proceed(
     state, log = jax.lax.fori_loop(0, num_rounds + num_judged, body, (state, blank))
     judged = Judged(jnp.float32(jnp.nan), jnp.int32(0))
     if num_judged:
-        returns, failed = (
-            jax.lax.dynamic_slice_in_dim(rows[:, 0], num_rounds, num_judged)
-            for rows in (log.returns, log.failed)
+        returns, failed, goals = jax.tree.map(
+            lambda rows: jax.lax.dynamic_slice_in_dim(rows[:, 0], num_rounds, num_judged),
+            (log.returns, log.failed, log.played.goals),
         )
-        judged = Judged(returns.mean(), failed.sum())
+        judged = judge(returns, failed, jax.vmap(partial(achieved_goals, env))(goals))
     return state, jax.tree.map(lambda rows: rows[:max_rounds], log), judged
 
 

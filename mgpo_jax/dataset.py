@@ -23,6 +23,7 @@ from mgpo_jax.files import hash_file, new_folder, write_arrays, write_json
 from mgpo_jax.schema import (
     STRICT,
     ArrayField,
+    DemonstratorName,
     Json,
     Name,
     Sha256,
@@ -38,7 +39,8 @@ FORMAT = 2  # 1 had neither rewards nor last observations, and called achieved g
 ARRAYS = "trajectories.npz"
 MANIFEST = "manifest.json"
 SIZES: Sizes = {"trajectory": range(1, 2**31), "step": range(1, 2**31)}
-STEP_ARRAYS = Trajectory._fields[:-1]  # those with a row for every step
+STEP_ARRAYS = tuple(name for name in Trajectory._fields if name != "length")
+"""Those with a row for every step, of trajectories; datasets have ``rewards`` beside them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +53,7 @@ class Dataset:
     goal_reached: np.ndarray  # [total] bool
     outcomes: np.ndarray  # [total, G] float32
     lengths: np.ndarray  # [N] int32
+    intended: np.ndarray | None = None  # like actions: what the demonstrator meant to do
     task_hashes: np.ndarray | None = None  # [N] uint64, of ``Environment.fingerprint``
     rewards: np.ndarray | None = None  # [total] float32
     last_obs: np.ndarray | None = None  # [N, ...], the observation after the last action
@@ -90,7 +93,7 @@ class Dataset:
             mask = real.reshape(real.shape + (1,) * (steps.ndim - 1))
             return np.where(mask, steps[rows], np.zeros((), steps.dtype))
 
-        arrays = {name: padded(getattr(self, name)) for name in STEP_ARRAYS}
+        arrays = {name: padded(self.arrays[name]) for name in STEP_ARRAYS if name in self.arrays}
         length: Any = lengths.astype(np.int32)  # numpy arrays go where jax's do
         return Trajectory(**arrays, length=length)
 
@@ -130,7 +133,7 @@ class _Manifest(BaseModel):
     num_steps: Count = 0
     """0 where the manifest does not say."""
     env: Name | None = None
-    policy: Name | None = None
+    policy: DemonstratorName | None = None
     settings: dict[str, Json] = {}
     seed: Seed | None = None
     versions: dict[str, str] = {}
@@ -207,7 +210,7 @@ def _read_manifest(
         )
     for name, wanted in made.items():
         found = document.get(name, wanted)
-        if found != wanted and not (name == "env" and _same_data(found, wanted, path)):
+        if found != wanted and not (name == "env" and found and _same_data(found, wanted, path)):
             raise DataError(f"{path}: {name} is {shown(found)}, wanted {shown(wanted)}; {mend}")
     return document, manifest
 
@@ -243,6 +246,7 @@ def _fields(spec: EnvSpec | None) -> dict[str, ArrayField]:
         "goal_reached": ArrayField(("step",), "bool"),
         "outcomes": goals,
         "task_hashes": ArrayField(("trajectory",), "uint64", required=False),
+        "intended": replace(actions, required=False),
         "rewards": ArrayField(("step",), "float32", required=False),
         "last_obs": replace(obs, shape=("trajectory", *obs.shape[1:]), required=False),
         "variants": ArrayField(("trajectory",), "int32", low=0, required=False),

@@ -1,14 +1,20 @@
-"""Encoders: how the network turns an observation of any shape and dtype into a token."""
+"""Encoders: how the network turns an observation of any shape and dtype into a token.
+
+``settings.ENCODERS`` finds them by name, with those that worlds and other packages bring.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Shaped
+import numpy as np
+from jaxtyping import Array, Float, Int, Shaped
+
+from envs.base import ObsLayout
+from envs.registry import Encoder
 
 
 class Linear(nn.Module):
@@ -34,7 +40,89 @@ class Linear(nn.Module):
         return product + bias
 
 
-ENCODERS: dict[str, Callable[[tuple[int, ...], int], nn.Module]] = {
-    "linear": lambda obs_shape, width: Linear(width, len(obs_shape)),
-}
-"""By the name in a network's config: ``(shape of an observation, width of a token) -> module``."""
+class Cells(nn.Module):
+    """An embedding for each digit of each cell's code and for each count, and a linear map of the rest.
+
+    It is a linear layer on the observation whose codes and counts are expanded to one-hots, computed by
+    looking up rows of its kernel. Codes and counts are rounded, and those out of range count as the
+    nearest one in it.
+
+    Attributes:
+      width: size of a token.
+      layout: what the numbers of a flat observation are.
+    """
+
+    width: int
+    layout: ObsLayout
+
+    @nn.compact
+    def __call__(self, obs: Shaped[Array, "... D"]) -> Float[Array, "..."]:
+        """Tokens ``[*batch, E]`` of observations ``[*batch, D]``."""
+        layout = self.layout
+        num_coded = layout.num_cells + layout.num_counts
+        num_rest = obs.shape[-1] - num_coded
+        # Every code and count activates one row a digit: as many inputs are not 0.
+        active = layout.num_cells * len(layout.code_sizes) + layout.num_counts + num_rest
+        init = nn.initializers.normal(active**-0.5)
+        cells = (layout.num_cells, sum(layout.code_sizes), self.width)
+        counts = (layout.num_counts, layout.max_count + 1, self.width)
+        kernel = self.param("kernel", init, (num_rest, self.width))
+        bias = self.param("bias", nn.initializers.zeros_init(), (self.width,))
+        numbers = obs.astype(jnp.float32)
+        token = numbers[..., num_coded:] @ kernel + bias
+        codes, amounts = jnp.split(numbers[..., :num_coded], [layout.num_cells], axis=-1)
+        token = _looked_up(token, self.param("cells", init, cells), digit_rows(codes, layout))
+        amounts = _whole(amounts, layout.max_count + 1)[..., None]
+        return _looked_up(token, self.param("counts", init, counts), amounts)
+
+
+def _whole(numbers: Float[Array, "..."], size: int) -> Int[Array, "..."]:
+    """The nearest integers from 0 to ``size`` - 1."""
+    return jnp.clip(jnp.round(numbers), 0, size - 1).astype(jnp.int32)
+
+
+def digit_rows(codes: Float[Array, "... C"], layout: ObsLayout) -> Int[Array, "... C digits"]:
+    """Which rows of a cell's table the digits of codes look up: those of each digit follow one another."""
+    sizes = np.array(layout.code_sizes, np.int32)
+    whole = _whole(codes, math.prod(layout.code_sizes))[..., None]
+    return whole // (np.cumprod(sizes) // sizes) % sizes + (np.cumsum(sizes) - sizes)
+
+
+def _looked_up(
+    token: Float[Array, "*batch E"],
+    tables: Float[Array, "cells rows E"],
+    rows: Int[Array, "*batch cells digits"],
+) -> Float[Array, "*batch E"]:
+    """The token plus some rows of each cell's table.
+
+    Cell by cell: all rows at once would be written to memory, and their gradient scattered over all tables.
+    """
+
+    def add(token: Array, cell: tuple[Array, Array]) -> tuple[Array, None]:
+        table, rows = cell
+        for digit in range(rows.shape[-1]):
+            token = token + table[rows[..., digit]]
+        return token, None
+
+    return jax.lax.scan(add, token, (tables, jnp.moveaxis(rows, -2, 0)))[0]
+
+
+def layout_fault(layout: ObsLayout, shape: tuple[int, ...]) -> str | None:
+    """What is wrong with a layout of observations of a shape, as the end of a sentence; None if nothing."""
+    sizes = layout.code_sizes
+    if min(layout.num_cells, layout.num_counts, layout.max_count, *sizes) < 0 or not all(sizes):
+        return "must hold no negative numbers and code sizes of at least 1"
+    if not sizes or math.prod(sizes) > 1 << 20 or layout.max_count >= 1 << 20:
+        return "must have 1 to 1048576 codes and counts"
+    if len(shape) != 1 or layout.num_cells + layout.num_counts > shape[0]:
+        return f"must describe a flat observation, found {layout} for one of shape {list(shape)}"
+    return None
+
+
+def _cells(obs_shape: tuple[int, ...], width: int, layout: ObsLayout | None) -> nn.Module:
+    assert layout is not None  # as ``transformer.network_config`` and ``policy_files`` see to
+    return Cells(width, layout)
+
+
+LINEAR = Encoder(name="linear", make=lambda obs_shape, width, layout: Linear(width, len(obs_shape)))
+CELLS = Encoder(name="cells", make=_cells, uses_layout=True, fault=layout_fault)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from annotated_types import Ge, Gt, Le
 
 from envs.errors import UsageError
-from envs.registry import Judgement, Registry
+from envs.registry import Judgement, Registry, World
 from mgpo_jax.settings import (
     NotNegative,
     NumGoals,
@@ -90,6 +90,15 @@ class Method:
         check_settings(hyper)
         if self.check is not None:
             load(self.check)(setting, hyper)
+
+    def hyper_in(self, world: World | None, values: Mapping[str, Any] | None = None) -> Any:
+        """The hyper-parameters in a world, which may have defaults of its own, with some values changed.
+
+        Raises:
+          UsageError: for a name that is none of this method's, with the methods that have it.
+        """
+        own = {} if world is None else world.method_defaults.get(self.name, {})
+        return self.hyper_from({**own, **(values or {})})
 
     def hyper_from(self, values: Mapping[str, Any]) -> Any:
         """The hyper-parameters with some values changed.

@@ -51,6 +51,8 @@ def check_fits(config: TransformerConfig, spec: EnvSpec, who: str = "the policy"
         "action_dim": (config.action_dim, spec.action_dim),
         "horizon": (config.horizon, spec.horizon),
     }
+    if config.obs_layout is not None:
+        facts["obs_layout"] = (config.obs_layout, spec.layout)
     for field, (found, want) in facts.items():
         if found != want:
             raise DataError(
@@ -69,6 +71,6 @@ def transformer_policy(config: TransformerConfig, params: Any) -> Policy:
         return network.apply(params, carry, action, obs, method="decode")
 
     def grow(cache: Any, num_steps: int) -> Any:
-        return grow_cache(cache, 2 * num_steps)
+        return grow_cache(cache, config.tokens_per_step * num_steps)
 
     return Policy(prefill, decode, grow, config.max_prompt_length)

@@ -26,7 +26,6 @@ from envs.errors import DataError, UsageError, shown
 from envs.registry import World, find
 from mgpo_jax.claims import claimed, cleaned_on_exit
 from mgpo_jax.distributions import HEADS
-from mgpo_jax.encoders import ENCODERS
 from mgpo_jax.files import (
     PLACE,
     TEMPORARY,
@@ -51,7 +50,7 @@ from mgpo_jax.schema import (
     read_arrays,
     read_document,
 )
-from mgpo_jax.settings import Index
+from mgpo_jax.settings import ENCODERS, Index
 from mgpo_jax.transformer import GoalTransformer, TransformerConfig
 
 FORMAT = 2  # 1 had flat observations of size obs_dim
@@ -245,8 +244,8 @@ def _fault(config: TransformerConfig) -> str | None:
     """What of a network does not fit together, after its types and ranges have been found right."""
     if config.head not in HEADS:
         return f"head must be one of {', '.join(HEADS)}, found {shown(config.head)}"
-    if config.encoder not in ENCODERS:
-        return f"encoder must be one of {', '.join(ENCODERS)}, found {shown(config.encoder)}"
+    if config.encoder not in (known := ENCODERS.names()):
+        return f"encoder must be one of {', '.join(known)}, found {shown(config.encoder)}"
     if config.obs_dtype not in DTYPES:
         return f"obs_dtype must be one of {', '.join(DTYPES)}, found {shown(config.obs_dtype)}"
     if config.embed_dim % config.num_heads:
@@ -255,7 +254,21 @@ def _fault(config: TransformerConfig) -> str | None:
     for name in ("obs_mean", "obs_std"):
         if len(getattr(config, name)) not in (0, size):
             return f"{name} must hold {size} numbers or none, found {len(getattr(config, name))}"
-    return None
+    return _layout_fault(config)
+
+
+def _layout_fault(config: TransformerConfig) -> str | None:
+    """What is wrong with the layout of observations in a network's config."""
+    layout = config.obs_layout
+    encoder = ENCODERS.find(config.encoder)
+    if not encoder.uses_layout:
+        return None if layout is None else f"obs_layout is of no use to encoder {config.encoder}"
+    if layout is None:
+        return f"obs_layout must not be null with encoder {config.encoder}"
+    if config.obs_mean:
+        return f"obs_mean must be empty with encoder {config.encoder}, whose codes are no amounts"
+    said = encoder.fault(layout, config.obs_shape)
+    return said and f"obs_layout {said}"
 
 
 def _check_blocks(path: Path, config: TransformerConfig) -> None:

@@ -30,6 +30,8 @@ from mgpo_jax.adaptation import (
     Adapter,
     AdaptLog,
     Judged,
+    achieved_goals,
+    judge,
     proceed,
     start,
 )
@@ -87,6 +89,9 @@ class Outcome(NamedTuple):
     """Those that the world ended because it broke down."""
     cpu_seconds: float
     """CPU time of all of them, without compilation."""
+    eval_achieved: np.ndarray | None = None
+    """``[S, N, C, M]``: share of the judging episodes that achieved each of the world's M named goals; None
+    in worlds without any (``Environment.goal_names``)."""
 
 
 def together(env: Environment, function: Callable, in_axes: Any = 0) -> Any:
@@ -117,7 +122,7 @@ def adapt(
       tasks: N tasks, stacked.
       method: who adapts, as a record or by name.
       hyper: the method's hyper-parameters, as its record or as a dict of those that differ from the
-        defaults.
+        defaults, which a world's record may change.
       seeds: independent adaptations to each task.
       episodes: the budget of each.
       seed: seed of all of them.
@@ -130,10 +135,10 @@ def adapt(
       UsageError: if the method cannot be used in this setting.
     """
     method = find(method) if isinstance(method, str) else method
-    if hyper is None or isinstance(hyper, dict):
-        hyper = method.hyper_from(hyper or {})
     if isinstance(world, str):
         world = find_world(world)
+    if hyper is None or isinstance(hyper, dict):
+        hyper = method.hyper_in(world if isinstance(world, World) else None, hyper or {})
     if isinstance(world, World):
         env, judged = world.make(), judged or world.judged
     else:
@@ -437,7 +442,13 @@ class Record(NamedTuple):
             num_episodes=num_episodes,
             num_failed=int(num_failed),
             cpu_seconds=cpu_seconds,
+            eval_achieved=_by_judgement(jax.tree.map(of_variant, self.judged.achieved)),
         )
+
+
+def _by_judgement(achieved: np.ndarray | None) -> np.ndarray | None:
+    """Shares [S, N, M, C] as [S, N, C, M]."""
+    return None if achieved is None else np.moveaxis(achieved, -1, -2)
 
 
 class Segment(NamedTuple):
@@ -581,7 +592,37 @@ def evaluate(
 ) -> tuple[np.ndarray, int]:
     """Mean returns ``[S, N]`` of queries with leaves ``[S, N, ..]``, one for each seed and task.
 
-    The second result is how many episodes a broken world ended.
+    The second result is how many episodes a broken world ended. ``evaluate_fully`` tells more.
+
+    Raises:
+      DataError: if the policy was made for another world, or a return is not finite.
+    """
+    judged = evaluate_fully(env, policy, tasks, queries, episodes=episodes, seed=seed)
+    return np.asarray(judged.return_), int(judged.num_failed.sum())
+
+
+def evaluate_fully(
+    env: Environment,
+    policy: LoadedPolicy,
+    tasks: Task,
+    queries: Query,
+    *,
+    episodes: int,
+    seed: int = 0,
+) -> Judged:
+    """Judge queries in fresh episodes.
+
+    Args:
+      env: the world.
+      policy: who acts.
+      tasks: N tasks, stacked.
+      queries: with leaves ``[S, N, ..]``, one for each seed and task.
+      episodes: how many each query is judged in.
+      seed: seed of the episodes.
+
+    Returns:
+      Numpy arrays: ``return_`` [S, N], ``num_failed`` [S, N] and, in worlds with M named goals,
+      ``achieved`` [S, N, M].
 
     Raises:
       DataError: if the policy was made for another world, or a return is not finite.
@@ -605,7 +646,7 @@ def evaluate(
             f"a return on task {task} with seed number {which} is {found.return_[which, task]}; the world "
             "or the policy is broken"
         )
-    return found.return_, int(found.num_failed.sum())
+    return found
 
 
 @cache
@@ -618,19 +659,19 @@ def _measurement(
         lane, query = own
         policy = transformer_policy(network, params)
 
-        def episode(key: PRNGKeyArray) -> tuple[Array, Array]:
+        def episode(key: PRNGKeyArray) -> tuple[Array, Array, Array | None]:
             done = rollout(key, env, policy, lane.task, query)
-            return done.return_, jnp.asarray(done.failed)
+            achieved = achieved_goals(env, done.trajectory)
+            return done.return_, jnp.asarray(done.failed), achieved
 
-        returns, failed = jax.lax.map(episode, jax.random.split(lane.key, num_episodes))
-        return Judged(returns.mean(), failed.sum())
+        return judge(*jax.lax.map(episode, jax.random.split(lane.key, num_episodes)))
 
     return _over_lanes(env, layout, measure)
 
 
 def cache_bytes(network: TransformerConfig) -> int:
     """Bytes of the key-value cache of an episode."""
-    num_tokens = network.max_prompt_length + 2 * network.horizon - 1
+    num_tokens = network.max_prompt_length + network.num_step_tokens(network.horizon)
     return 4 * 2 * network.num_layers * network.embed_dim * num_tokens
 
 

@@ -101,6 +101,10 @@ Sha256 = Annotated[str, StringConstraints(pattern=SHA256)]
 """The hash of a file."""
 Name = Annotated[str, StringConstraints(pattern=r"^\w[\w.-]{0,99}(:\w[\w.]{0,99})?$")]
 """The name of a world or a method, or its place as ``module:attribute``; it can stand in a path."""
+DemonstratorName = Annotated[
+    str, StringConstraints(max_length=200, pattern=r"^\w[\w.-]*(,\w+=[\w.+-]+)*$")
+]
+"""The name of a demonstrator, with the settings that were changed; it can stand in a path."""
 
 
 @cache

@@ -11,12 +11,13 @@ import dataclasses
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 from pydantic import PydanticUserError
 
 from envs.errors import UsageError, nearest, shown
+from envs.registry import ENCODER_PLACES, Encoder, Registry
 from mgpo_jax.schema import LIMITS, fault
 
 # Numbers enter programs with 32 bits. Sizes have upper bounds where more could only fill the memory.
@@ -37,8 +38,22 @@ BatchSize = Annotated[int, Ge(1), Le(65_536)]
 Width = Annotated[int, Ge(1), Le(16_384)]
 NumLayers = Annotated[int, Ge(1), Le(256)]
 
-Encoder = Literal["linear"]
-"""The names in ``encoders.ENCODERS``, which need jax."""
+TokensPerStep = Literal[2, 1]
+ENCODERS: Registry[Encoder] = Registry(
+    "encoder",
+    Encoder,
+    "mgpo_jax.encoders",
+    {
+        "linear": "mgpo_jax.encoders:LINEAR",
+        "cells": "mgpo_jax.encoders:CELLS",
+        **ENCODER_PLACES,
+    },
+)
+"""The encoders by name; their modules need jax and are imported when they are used."""
+if TYPE_CHECKING:
+    EncoderName = str
+else:
+    EncoderName = Literal[tuple(ENCODERS.names())]
 Head = Literal["categorical", "gaussian", "fixed_gaussian", "mixture", "binned"]
 """The names in ``distributions.HEADS``, which need jax."""
 
@@ -86,7 +101,7 @@ def check_values(settings_class: type, values: Mapping[str, Any]) -> None:
             continue
         choices = [part for part in get_parts(annotation) if get_origin(part) is Literal]
         if choices and isinstance(value, str):
-            raise nearest(value, get_args(choices[0]), flag(name))
+            raise nearest(value, list(map(str, get_args(choices[0]))), flag(name))
         raise UsageError(f"{flag(name)} {said}")
 
 
@@ -125,7 +140,8 @@ RECIPE_NETWORK: dict[str, Any] = {"dropout": 0.0, "num_heads": 4}
 """How the network of the general recipe differs from the paper's (Table 6)."""
 
 OF_WEIGHTS = (
-    "max_prompt_length", "prompt_order", "embed_dim", "num_layers", "num_heads", "encoder", "head"
+    "max_prompt_length", "prompt_order", "embed_dim", "num_layers", "num_heads", "encoder", "head",
+    "tokens_per_step",
 )  # fmt: skip
 """Settings of a network that its weights were made for; dropout is none, since it only trains."""
 

@@ -64,7 +64,7 @@ class Stats(NamedTuple):
 
     nll: Float[Array, "*batch"]
     correct: Float[Array, "*batch"]
-    """Actions whose likeliest prediction is the demonstrated one, within ``HIT`` in each dimension."""
+    """Steps whose likeliest action is the demonstrated (intended) one, within ``HIT`` in each dimension."""
     num_steps: Float[Array, "*batch"]
 
 
@@ -142,6 +142,8 @@ def bc_loss(
 ) -> tuple[Float[Array, ""], Stats]:
     """-sum_t log pi(a_t | p, h_{t-1}, o_t) of one trajectory, with p ~ P(p | tau) (Eq. 2).
 
+    The history h holds the executed actions. Where the demonstrator told what it intended, a_t is that.
+
     Args:
       params: weights of the network.
       key: random key.
@@ -164,8 +166,8 @@ def bc_loss(
         rngs={"dropout": key_dropout},
     )
     real = jnp.arange(len(trajectory.obs)) < trajectory.length
-    nll = -jnp.sum(jnp.where(real, distribution.log_prob(trajectory.actions), 0.0))
-    hits = jnp.abs(distribution.mode() - trajectory.actions) <= HIT
+    nll = -jnp.sum(jnp.where(real, distribution.log_prob(trajectory.labels), 0.0))
+    hits = jnp.abs(distribution.mode() - trajectory.labels) <= HIT
     hits = jnp.all(hits.reshape(len(real), -1), axis=1)
     correct = jnp.sum(hits & real).astype(jnp.float32)
     return nll, Stats(nll, correct, trajectory.length.astype(jnp.float32))
@@ -285,6 +287,11 @@ class Trainer:
         if config.obs_noise and not np.issubdtype(dataset.obs.dtype, np.floating):
             raise UsageError(
                 f"--obs-noise needs floating-point observations, the dataset's are {dataset.obs.dtype}"
+            )
+        if config.obs_noise and network_config.obs_layout is not None:
+            raise UsageError(
+                f"--obs-noise has no use where --encoder {network_config.encoder} rounds the codes and "
+                "counts of observations; leave it out"
             )
         network = GoalTransformer(network_config)
         self._key_init, key_steps, self._key_eval = jax.random.split(jax.random.key(config.seed), 3)

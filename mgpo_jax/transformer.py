@@ -2,8 +2,10 @@
 
 One sequence is ``(g_1 .. g_P, o_1, a_1, o_2, a_2, .., o_T)``: goals, observations and actions enter
 through three linear layers, observations and actions of one step share a learned timestep embedding,
-and the outputs at the observations are the action distributions. The module is written for one
-sequence and has three entries that share their layers: the full pass (training), and ``prefill`` /
+and the outputs at the observations are the action distributions. With one token a step
+(``tokens_per_step=1``) the sequence is ``(g_1 .. g_P, s_1, .., s_T)``, where s_t is the sum of what
+embeds a_{t-1}, o_t and the timestep: half as many tokens, which know the same. The module is written for
+one sequence and has three entries that share their layers: the full pass (training), and ``prefill`` /
 ``decode`` with an explicit key-value cache (acting).
 
 Two deliberate differences from the authors' code: prompt slots get a learned position embedding
@@ -23,13 +25,13 @@ import jax.numpy as jnp
 from annotated_types import Ge, Gt, Le, MaxLen
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from envs.base import EnvSpec
-from envs.errors import nearest
+from envs.base import EnvSpec, ObsLayout
+from envs.errors import UsageError, nearest
+from envs.registry import Encoder
 from mgpo_jax.distributions import HEADS, Distribution
-from mgpo_jax.encoders import ENCODERS
 from mgpo_jax.prompts import Prompt
 from mgpo_jax.schema import STRICT
-from mgpo_jax.settings import NumGoals, NumLayers, Share, Width
+from mgpo_jax.settings import ENCODERS, NumGoals, NumLayers, Share, TokensPerStep, Width
 
 # Attention over the keys of one query block at a time: never the full score matrix.
 QUERY_BLOCK = 128
@@ -56,7 +58,7 @@ class TransformerConfig:
     obs_dtype: str = "float32"
     """Dtype of an observation."""
     encoder: str = "linear"
-    """How observations become tokens, one of ``encoders.ENCODERS``."""
+    """How observations become tokens, one of ``settings.ENCODERS``."""
     head: str = "categorical"
     """The action distribution, one of ``distributions.HEADS``."""
     max_prompt_length: NumGoals = 5
@@ -73,20 +75,29 @@ class TransformerConfig:
     where observations are standardized (empty: they are not)."""
     obs_std: tuple[Annotated[float, Gt(0), Le(1e18)], ...] = ()
     """Standard deviation of every component, likewise."""
+    tokens_per_step: TokensPerStep = 2
+    """An observation and an action as two tokens, or the last action and the observation as one."""
+    obs_layout: ObsLayout | None = None
+    """What the numbers of an observation are, for the encoders that use it."""
+
+    def num_step_tokens(self, num_steps: int | Int[Array, ""]) -> Any:
+        """The number of tokens of some steps, up to the last observation."""
+        return self.tokens_per_step * num_steps - (self.tokens_per_step - 1)
 
 
 def network_config(spec: EnvSpec, head: str | None = None, **sizes: Any) -> TransformerConfig:
     """The network for a world, with Table 6's sizes unless given others.
 
     Raises:
-      UsageError: if there is no such head or encoder, or the head is not one for the world's actions.
+      UsageError: if there is no such head or encoder, the head is not one for the world's actions, or the
+        encoder not one for its observations.
     """
     known = [name for name in HEADS if (name == "categorical") == spec.discrete]
     head = head or known[0]
     if head not in known:
         raise nearest(head, known, f"head for {spec.name}")
-    if sizes.get("encoder", "linear") not in ENCODERS:
-        raise nearest(sizes["encoder"], ENCODERS, "encoder")
+    encoder = sizes.get("encoder", "linear")
+    layout = _layout_for(ENCODERS.find(encoder), spec)
     return TransformerConfig(
         obs_shape=spec.obs.shape,
         obs_dtype=spec.obs.dtype,
@@ -94,8 +105,26 @@ def network_config(spec: EnvSpec, head: str | None = None, **sizes: Any) -> Tran
         action_dim=spec.action_dim,
         horizon=spec.horizon,
         head=head,
+        obs_layout=layout,
         **sizes,
     )
+
+
+def _layout_for(encoder: Encoder, spec: EnvSpec) -> ObsLayout | None:
+    """The layout of a world's observations, if the encoder uses it."""
+    if not encoder.uses_layout:
+        return None
+    if spec.layout is None:
+        raise UsageError(
+            f"--encoder {encoder.name} embeds codes and counts, the observations of {spec.name} are "
+            f"{spec.obs} without a layout of them; choose another encoder"
+        )
+    if said := encoder.fault(spec.layout, spec.obs.shape):
+        raise UsageError(
+            f"--encoder {encoder.name} cannot be used in {spec.name}: the layout of its observations "
+            f"{said}; choose another encoder"
+        )
+    return spec.layout
 
 
 class KVCache(NamedTuple):
@@ -189,7 +218,8 @@ class GoalTransformer(nn.Module):
         config = self.config
         small = nn.initializers.normal(0.02)
         self.embed_goal = nn.Dense(config.embed_dim)
-        self.embed_obs = ENCODERS[config.encoder](config.obs_shape, config.embed_dim)
+        encoder = ENCODERS.find(config.encoder)
+        self.embed_obs = encoder.make(config.obs_shape, config.embed_dim, config.obs_layout)
         self.embed_action = nn.Dense(config.embed_dim)
         self.embed_time = self.param("embed_time", small, (config.horizon, config.embed_dim))
         if config.prompt_order:
@@ -214,20 +244,18 @@ class GoalTransformer(nn.Module):
         """
         num_steps = obs.shape[0]
         num_slots = self.config.max_prompt_length
-        time = self.embed_time[:num_steps]
-        pairs = jnp.stack([self._obs_token(obs, time), self._action_token(actions, time)], axis=1)
-        steps = pairs.reshape(2 * num_steps, -1)[:-1]  # nothing follows the last action
+        steps = self._step_tokens(obs, actions, self.embed_time[:num_steps])
         x = self.norm_in(jnp.concatenate([self._prompt_tokens(prompt), steps]))
         x = self.dropout(x, deterministic=deterministic)
 
-        num_tokens = num_slots + 2 * num_steps - 1
-        seen = jnp.concatenate([prompt.mask, jnp.ones(2 * num_steps - 1, bool)])
+        num_tokens = num_slots + len(steps)
+        seen = jnp.concatenate([prompt.mask, jnp.ones(len(steps), bool)])
         positions = jnp.arange(num_tokens)
         drop = lambda weights: self.dropout(weights, deterministic=deterministic)  # noqa: E731
         for index, block in enumerate(self.blocks):
             last = index == self.config.num_layers - 1
             # Only observations are read out, so the last layer computes nothing else.
-            rows = slice(num_slots, None, 2) if last else slice(None)
+            rows = slice(num_slots, None, self.config.tokens_per_step) if last else slice(None)
             row_positions = range(num_tokens)[rows]
 
             def attend(query: Array, key: Array, value: Array, at: range = row_positions) -> Array:
@@ -260,15 +288,18 @@ class GoalTransformer(nn.Module):
     ) -> tuple[Distribution, KVCache]:
         """Append (a_{t-1}, o_t); returns pi(a_t) and the longer cache.
 
-        The cache must have room for two more tokens (``grow_cache``).
+        The cache must have room for the tokens of one more step (``grow_cache``).
         """
-        times = jax.lax.dynamic_slice_in_dim(self.embed_time, cache.step - 1, 2)
-        tokens = [
-            self._action_token(jnp.asarray(action)[None], times[:1]),
-            self._obs_token(obs[None], times[1:]),
-        ]
-        x = self.norm_in(jnp.concatenate(tokens))
-        return self._extend(x, cache, at=self.config.max_prompt_length + 2 * cache.step - 1)
+        config, action = self.config, jnp.asarray(action)[None]
+        if config.tokens_per_step == 1:
+            time = jax.lax.dynamic_slice_in_dim(self.embed_time, cache.step, 1)
+            tokens = self._obs_token(obs[None], time) + self._embedded(action)
+        else:
+            times = jax.lax.dynamic_slice_in_dim(self.embed_time, cache.step - 1, 2)
+            pair = self._action_token(action, times[:1]), self._obs_token(obs[None], times[1:])
+            tokens = jnp.concatenate(pair)
+        at = config.max_prompt_length + config.num_step_tokens(cache.step)
+        return self._extend(self.norm_in(tokens), cache, at=at)
 
     def _extend(
         self, x: Float[Array, "R E"], cache: KVCache, at: int | Int[Array, ""]
@@ -315,9 +346,22 @@ class GoalTransformer(nn.Module):
         return self.embed_obs(obs) + time
 
     def _action_token(self, actions: Array, time: Array) -> Float[Array, "T E"]:
+        return self._embedded(actions) + time
+
+    def _embedded(self, actions: Array) -> Float[Array, "T E"]:
         if self.config.head == "categorical":
             actions = jax.nn.one_hot(actions, self.config.action_dim)
-        return self.embed_action(actions) + time
+        return self.embed_action(actions)
+
+    def _step_tokens(
+        self, obs: Shaped[Array, "T ..."], actions: Array, time: Float[Array, "T E"]
+    ) -> Float[Array, "S E"]:
+        """The tokens of T steps, up to the last observation."""
+        if self.config.tokens_per_step == 1:
+            before = self._embedded(actions)[:-1]  # nothing was done before the first observation
+            return self._obs_token(obs, time) + jnp.pad(before, ((1, 0), (0, 0)))
+        pairs = jnp.stack([self._obs_token(obs, time), self._action_token(actions, time)], axis=1)
+        return pairs.reshape(2 * len(obs), -1)[:-1]  # nothing follows the last action
 
     def _read_out(self, x: Float[Array, "R E"]) -> Distribution:
         return HEADS[self.config.head].make(self.head(self.norm_out(x)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,8 @@ import numpy as np
 
 from envs.maze import MAZE15
 from envs.maze.env import MazeRunner
-from envs.registry import World
+from envs.registry import Judgement, World
+from envs.wrappers import Wrapper
 from experiments.store.results import Results
 from mgpo_jax.runner import Reached
 
@@ -38,6 +40,19 @@ FORMAT_1 = {
     "best.prompt.goals": "best_goals",
     "best.prompt.mask": "best_masks",
 }
+
+
+@dataclass(frozen=True)
+class Named(Wrapper):
+    """A world whose first goals have names."""
+
+    goal_names: tuple[str, ...] = ("down", "right")
+
+
+LUCKY = replace(
+    TINY, make=lambda: Named(ENV), judged=Judgement(mode="sample", episodes=4), num_test_tasks=2
+)
+"""The same, judged by sampled actions and with names for its goals."""
 
 
 def made_results(method: str = "ucb", shift: float = 0.0, **changes: Any) -> Results:

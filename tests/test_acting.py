@@ -31,8 +31,10 @@ def untrained(**changes):
     config = replace(config, **changes)
     prompt = Prompt(jnp.zeros((3, 2)), jnp.ones(3, bool))
     obs = jnp.zeros((2, *config.obs_shape), config.obs_dtype)
+    discrete = config.head == "categorical"
+    actions = jnp.zeros(2, jnp.int32) if discrete else jnp.zeros((2, config.action_dim))
     init = GoalTransformer(config).init
-    shapes = jax.eval_shape(init, jax.random.key(0), prompt, obs, jnp.zeros(2, jnp.int32))
+    shapes = jax.eval_shape(init, jax.random.key(0), prompt, obs, actions)
     rng = np.random.default_rng(1)
     params = jax.tree.map(
         lambda leaf: jnp.asarray(0.5 * rng.standard_normal(leaf.shape), leaf.dtype), shapes

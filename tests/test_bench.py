@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +17,12 @@ from mgpo_jax.transformer import TransformerConfig
 CONFIG = TransformerConfig(obs_shape=(3, 2), goal_dim=2, action_dim=4, horizon=9, embed_dim=8)
 
 
-def products(num_goals: int, num_steps: int) -> int:
+def products(num_goals: int, num_steps: int, tokens: int) -> int:
     """FLOP of one pass, product by product (2 m n for a vector of m with a matrix m x n)."""
     width = CONFIG.embed_dim
     square = 2 * width * width
-    is_obs = [False] * num_goals + [index % 2 == 0 for index in range(2 * num_steps - 1)]
+    num_tokens = 2 * num_steps - 1 if tokens == 2 else num_steps
+    is_obs = [False] * num_goals + [index % tokens == 0 for index in range(num_tokens)]
     total = 0
     for layer in range(CONFIG.num_layers):
         for position, read_out in enumerate(is_obs):
@@ -33,10 +35,12 @@ def products(num_goals: int, num_steps: int) -> int:
     return total + num_steps * (embed + 2 * width * CONFIG.action_dim)
 
 
+@pytest.mark.parametrize("tokens", [2, 1])
 @pytest.mark.parametrize(("num_goals", "num_steps"), [(1, 1), (3, 1), (1, 4), (5, 9)])
-def test_flops_are_those_of_the_products(num_goals: int, num_steps: int) -> None:
-    counted = sequence_flops(CONFIG, num_goals, np.array([num_steps, num_steps]))
-    assert counted.tolist() == [products(num_goals, num_steps)] * 2
+def test_flops_are_those_of_the_products(num_goals: int, num_steps: int, tokens: int) -> None:
+    config = replace(CONFIG, tokens_per_step=tokens)
+    counted = sequence_flops(config, num_goals, np.array([num_steps, num_steps]))
+    assert counted.tolist() == [products(num_goals, num_steps, tokens)] * 2
 
 
 @pytest.mark.slow

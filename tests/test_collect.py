@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import envs
-from envs.errors import DataError
+from envs.errors import DataError, UsageError
 from envs.wrappers import Wrapper
-from experiments.datasets import collect
+from experiments.datasets import collect, find_demonstrator
 from mgpo_jax.tasks import benchmark_tasks, task_hashes
 
 WORLD = envs.make("gridworld")
@@ -51,6 +51,35 @@ def test_episodes_of_broken_worlds_are_counted_not_kept() -> None:
     assert len(dataset) == 500
     assert dataset.lengths.max() < 30
     assert facts["failed_episodes"] == facts["tried_again"] > 10
+
+
+def test_settings_that_are_fixed() -> None:
+    with pytest.raises(
+        UsageError, match="the demonstrator expert has no settings to change; leave out"
+    ):
+        find_demonstrator(envs.find("gridworld"), WORLD, "expert,drop=0.3")
+
+
+def test_a_dataset_keeps_what_the_demonstrator_intended() -> None:
+    """It executes one action more than it means to, modulo their number, in every step."""
+    agent = EXPERT.agent(EXPERT.weights)
+    num = WORLD.spec.action_dim
+
+    def missing(step):
+        meant, quits, memory = step
+        return (meant + 1) % num, quits, (memory, meant)
+
+    noisy = EXPERT._replace(
+        agent=lambda weights: agent._replace(
+            begin=lambda *args: missing(agent.begin(*args)),
+            proceed=lambda key, memory, *args: missing(agent.proceed(key, memory[0], *args)),
+            intended=lambda memory: memory[1],
+        )
+    )
+    dataset, _ = collect(WORLD, noisy, 40, seed=0, num_test_tasks=50)
+    np.testing.assert_array_equal(dataset.actions, (dataset.intended + 1) % num)
+    assert dataset.intended.dtype == dataset.actions.dtype
+    assert len(np.unique(dataset.intended)) > 2
 
 
 def test_a_task_that_cannot_be_demonstrated_is_an_error() -> None:

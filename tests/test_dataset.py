@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from envs.base import ArraySpec, Box, Discrete, EnvSpec, Trajectory
+from envs.base import ArraySpec, Box, Discrete, EnvSpec
 from envs.errors import DataError
 from mgpo_jax.dataset import (
     ARRAYS,
@@ -100,8 +100,8 @@ def test_gather_cuts_and_pads_with_zeros(dataset):
     np.testing.assert_array_equal(part.length, [5, 3, 1])
     for row, (index, length) in enumerate([(2, 5), (0, 3), (2, 1)]):
         start = [0, 3, 4, 13][index]
-        for name in Trajectory._fields[:-1]:
-            found, source = getattr(part, name)[row], getattr(dataset, name)
+        for name, rows in part.steps.items():
+            found, source = rows[row], getattr(dataset, name)
             assert found.dtype == source.dtype
             np.testing.assert_array_equal(found[:length], source[start : start + length])
             assert not found[length:].any()
@@ -112,6 +112,32 @@ def test_gather_of_a_continuous_dataset(dataset):
     part = replace(dataset, actions=actions).gather(np.array([3]), np.array([2]), 4)
     np.testing.assert_array_equal(part.actions[0, :2], actions[13:15])
     assert not part.actions[0, 2:].any()
+
+
+def with_intended(dataset):
+    """Every other action was meant to be another one."""
+    turned = np.arange(len(dataset.actions)) % 2 == 0
+    return replace(dataset, intended=((dataset.actions + turned) % 4).astype(np.int32))
+
+
+def test_intended_actions_are_kept_beside_the_executed_ones(tmp_path, dataset):
+    noisy = with_intended(dataset)
+    save_dataset(tmp_path / "noisy", noisy, {})
+    loaded, _ = load_dataset(tmp_path / "noisy", SPEC)
+    assert_equal(loaded, noisy)
+    assert_equal(loaded.slice(1, 3), with_intended(dataset).slice(1, 3))
+    part = loaded.gather(np.array([3, 1]), np.array([2, 1]), 4)
+    np.testing.assert_array_equal(part.intended[0, :2], noisy.intended[13:15])
+    assert not part.intended[0, 2:].any()
+    assert (part.labels[0] != part.actions[0]).any()
+
+
+def test_a_dataset_without_intended_actions_has_the_same_bytes_as_ever(folder, dataset):
+    assert dataset.gather(np.array([0]), np.array([1]), 1).intended is None
+    assert list(np.load(folder / ARRAYS)) == [
+        "obs", "actions", "achieved_goals", "goal_reached", "outcomes", "lengths", "task_hashes",
+        "rewards", "last_obs",
+    ]  # fmt: skip
 
 
 def test_slice(dataset):
@@ -358,6 +384,18 @@ ARRAY_DAMAGE = {
         lambda a: a["actions"].__setitem__(3, 4),
         "actions holds 4 at step 3, must be from 0 to 3",
     ),
+    "intended action too large": (
+        lambda a: a.update(intended=a["actions"] + 4),
+        "intended holds [4-7] at step 0, must be from 0 to 3",
+    ),
+    "intended action of other steps": (
+        lambda a: a.update(intended=a["actions"][1:]),
+        r"intended has shape \[16\], wanted \[step 17\]",
+    ),
+    "continuous intended actions": (
+        lambda a: a.update(intended=a["actions"] / 2),
+        "intended must hold integers, found float64",
+    ),
     "negative action": (lambda a: a["actions"].__setitem__(3, -1), "actions holds -1 at step 3"),
     "missing hashes": (
         lambda a: a.update(task_hashes=a["task_hashes"][:1]),
@@ -408,6 +446,7 @@ def test_pickled_arrays_are_never_loaded(folder):
     ("manifest", "says"),
     [
         ({"env": "gridworld"}, "env is 'gridworld', wanted 'maze15'"),
+        ({"env": None}, "env is None, wanted .maze15."),
         ({"env": "nowhere.such:WORLD"}, "env is 'nowhere.such:WORLD', wanted 'maze15'"),
         ({"policy": "random"}, "policy is 'random', wanted 'astar4'"),
         ({"seed": 7}, "seed is 7, wanted 0"),

@@ -11,16 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs.base import ArraySpec
+from envs.base import ArraySpec, ObsLayout
 from envs.errors import UsageError
 from envs.maze.env import MazeRunner
 from envs.wrappers import Noisy, Wrapper
 from mgpo_jax.dataset import BatchPlan, Dataset, load_dataset, save_dataset
-from mgpo_jax.encoders import ENCODERS
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.prompts import Prompt
 from mgpo_jax.runner import adapt
-from mgpo_jax.settings import TrainConfig
+from mgpo_jax.settings import ENCODERS, TrainConfig
 from mgpo_jax.sharding import device_mesh
 from mgpo_jax.tasks import sample_tasks
 from mgpo_jax.training import Trainer, batch_stream, bc_loss
@@ -47,7 +46,7 @@ def test_the_linear_encoder_is_a_dense_layer_on_all_numbers(lead):
     flat = jnp.asarray(rng.normal(size=(*lead, 6)), jnp.float32)
     expected = nn.Dense(5).apply(params, flat)
     for shape in ((6,), (2, 3), (3, 1, 2)):
-        encoder = ENCODERS["linear"](shape, 5)
+        encoder = ENCODERS.find("linear").make(shape, 5, None)
         obs = flat.reshape(*lead, *shape)
         np.testing.assert_array_equal(encoder.apply(params, obs), expected)
         # Initial weights are drawn in the same way, too.
@@ -60,12 +59,126 @@ def test_the_linear_encoder_is_a_dense_layer_on_all_numbers(lead):
 @pytest.mark.parametrize("dtype", [np.uint8, np.int32, bool])
 def test_integers_count_as_they_are(dtype):
     obs = np.random.default_rng(0).integers(0, 2 if dtype is bool else 200, (4, 2, 3)).astype(dtype)
-    encoder = ENCODERS["linear"]((2, 3), 5)
+    encoder = ENCODERS.find("linear").make((2, 3), 5, None)
     params = encoder.init(jax.random.key(0), jnp.asarray(obs))
     found = encoder.apply(params, jnp.asarray(obs))
     assert found.dtype == jnp.float32
     expected = obs.reshape(4, 6).astype(np.float64) @ np.asarray(params["params"]["kernel"])
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-3)
+
+
+LAYOUTS = {
+    "digits": ObsLayout(num_cells=6, code_sizes=(5, 2, 3), num_counts=2, max_count=4),
+    "whole codes": ObsLayout(num_cells=6, code_sizes=(30,), num_counts=2, max_count=4),
+}
+
+
+def coded(layout, lead, seed=0):
+    """Observations of codes and counts, followed by three numbers."""
+    rng = np.random.default_rng(seed)
+    codes = rng.integers(np.prod(layout.code_sizes), size=(*lead, layout.num_cells))
+    counts = rng.integers(layout.max_count + 1, size=(*lead, layout.num_counts))
+    numbers = rng.normal(size=(*lead, 3))
+    return jnp.asarray(np.concatenate([codes, counts, numbers], axis=-1), jnp.float32)
+
+
+def one_hots(obs, layout):
+    """One observation with its codes, digit by digit, and its counts as one-hots."""
+    parts = []
+    for code in obs[: layout.num_cells].astype(int):
+        rest = code
+        for size in layout.code_sizes:
+            rest, digit = divmod(rest, size)
+            parts.append(np.eye(size)[digit])
+    num_coded = layout.num_cells + layout.num_counts
+    for count in obs[layout.num_cells : num_coded].astype(int):
+        parts.append(np.eye(layout.max_count + 1)[count])
+    return np.concatenate([*parts, obs[num_coded:]])
+
+
+def dense_kernel(params):
+    """The weights of the same linear layer on one-hots."""
+    parts = params["params"]
+    rows = [parts[name].reshape(-1, parts[name].shape[-1]) for name in ("cells", "counts")]
+    return jnp.concatenate([*rows, parts["kernel"]]), parts["bias"]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+@pytest.mark.parametrize("lead", [(), (4,), (2, 3)])
+def test_cells_are_a_dense_layer_on_one_hots(layout, lead):
+    """Its values, and its gradient with respect to the weights."""
+    obs = coded(layout, lead)
+    encoder = ENCODERS.find("cells").make((11,), 5, layout)
+    params = encoder.init(jax.random.key(0), obs)
+    rows = np.stack([one_hots(row, layout) for row in np.asarray(obs).reshape(-1, 11)])
+    kernel, bias = dense_kernel(params)
+    expected = (rows @ kernel + bias).reshape(*lead, 5)
+    np.testing.assert_allclose(encoder.apply(params, obs), expected, rtol=1e-5, atol=1e-6)
+    weights = np.random.default_rng(1).normal(size=(*lead, 5)).astype(np.float32)
+    grads = jax.grad(lambda params: (encoder.apply(params, obs) * weights).sum())(params)
+    kernel, bias = dense_kernel(grads)
+    np.testing.assert_allclose(kernel, rows.T @ weights.reshape(-1, 5), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(bias, weights.reshape(-1, 5).sum(axis=0), rtol=1e-5, atol=1e-6)
+
+
+def test_codes_and_counts_are_rounded_into_their_range():
+    """As noise on observations leaves them; the numbers beside them stay as they are."""
+    layout = LAYOUTS["digits"]
+    encoder = ENCODERS.find("cells").make((11,), 5, layout)
+    obs = coded(layout, (4,))
+    params = encoder.init(jax.random.key(0), obs)
+    apply = jax.jit(encoder.apply)
+    blurred = obs + np.where(np.arange(11) < 8, 0.4, 0.0)
+    np.testing.assert_array_equal(apply(params, blurred), apply(params, obs))
+    largest = np.where(np.arange(11) < 6, 29, np.where(np.arange(11) < 8, 4, obs))
+    beyond = np.where(np.arange(11) < 8, largest + 7, obs)
+    np.testing.assert_array_equal(apply(params, beyond), apply(params, largest))
+    # A layout without numbers, counts or cells is one, too.
+    for cells, counts in ((11, 0), (0, 11), (4, 7)):
+        all_coded = replace(layout, num_cells=cells, num_counts=counts)
+        whole = ENCODERS.find("cells").make((11,), 5, all_coded)
+        zeros = jnp.zeros((2, 11))
+        assert whole.apply(whole.init(jax.random.key(0), zeros), zeros).shape == (2, 5)
+
+
+def coded_config(**changes):
+    layout = LAYOUTS["digits"]
+    return replace(FLAT, obs_shape=(11,), encoder="cells", obs_layout=layout, **changes)
+
+
+@pytest.mark.parametrize("tokens", [2, 1])
+def test_cells_in_the_network_step_by_step_as_in_the_full_pass(tokens):
+    config = coded_config(tokens_per_step=tokens)
+    params, (prompt, _, actions) = params_of(config), inputs()
+    obs = coded(config.obs_layout, (HORIZON,))
+    policy = LoadedPolicy(config, params, {}).policy
+    distribution, carry = policy.prefill(prompt, obs[0])
+    carry, steps = policy.grow(carry, HORIZON - 1), [distribution.logits]
+    for time in range(1, HORIZON):
+        distribution, carry = policy.decode(carry, actions[time - 1], obs[time])
+        steps.append(distribution.logits)
+    expected = GoalTransformer(config).apply(params, prompt, obs, actions).logits
+    np.testing.assert_allclose(jnp.stack(steps), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_worlds_without_a_layout_have_no_cells():
+    maze = MazeRunner(name="maze15", side=15, horizon=64).spec
+    with pytest.raises(
+        UsageError, match=r"--encoder cells embeds codes .* maze15 are float32\[6\]"
+    ):
+        network_config(maze, encoder="cells")
+    spec = replace(maze, obs=ArraySpec((11,)), layout=LAYOUTS["digits"])
+    assert network_config(spec, encoder="cells").obs_layout == LAYOUTS["digits"]
+    assert network_config(spec).obs_layout is None
+    with pytest.raises(UsageError, match="layout of its observations must describe a flat"):
+        network_config(replace(spec, obs=ArraySpec((7,))), encoder="cells")
+
+
+def test_noise_on_codes_is_refused():
+    config = coded_config()
+    data = replace(DATASET, obs=np.asarray(coded(config.obs_layout, (len(DATASET.obs),))))
+    with pytest.raises(UsageError, match="--obs-noise has no use where --encoder cells"):
+        Trainer(TrainConfig(obs_noise=0.1), config, data, device_mesh(1))
 
 
 def params_of(config, scale=0.4):

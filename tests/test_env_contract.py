@@ -206,13 +206,18 @@ def test_episodes_end_once_and_absorb(world):
 def test_returns_stay_in_the_range_of_the_spec(world):
     low, high = world["env"].spec.return_range
     assert low < high
-    for returns in (world["steps"].reward.sum(1), world["best"]):
+    returns_of = [world["steps"].reward.sum(1)]
+    if not np.isnan(world["best"]).all():  # else the optimum is unknown
+        returns_of.append(world["best"])
+    for returns in returns_of:
         assert np.isfinite(returns).all()
         assert (returns >= low - 1e-4).all()
         assert (returns <= high + 1e-4).all()
 
 
 def test_no_play_beats_the_optimal_return(world):
+    if np.isnan(world["best"]).all():
+        pytest.skip("the optimum is unknown")
     best = np.sort(world["best"])[::-1][:NUM_LANES]
     assert (world["steps"].reward.sum(1) <= best + 1e-4).all()
 
@@ -234,6 +239,8 @@ def test_the_outcome_of_a_solved_task_is_its_goal(world):
     steps = world["steps"]
     goals = np.asarray(jax.vmap(world["env"].task_goal)(world["easy"]))
     solved = steps.terminated.any(1)
+    if np.isnan(jax.vmap(world["env"].optimal_return)(world["easy"])).all():
+        pytest.skip("the optimum is unknown, so that nobody knows which episodes solve their tasks")
     if not solved.any():
         pytest.skip("random play solves none of the easiest tasks")
     np.testing.assert_allclose(steps.outcome[solved, -1], goals[solved], atol=1e-6)
@@ -263,7 +270,8 @@ def test_prompt_goals_vary(world):
 def test_tasks_of_another_shape_are_refused(world):
     env, tasks = world["env"], jax.tree.map(np.asarray, world["tasks"])
     for index, leaf in enumerate(jax.tree.leaves(tasks)):
-        for bad in (leaf[:, None], leaf[..., :-1], leaf + 0.5, leaf.astype(str)):
+        shorter = leaf[..., :-1] if leaf.ndim > 1 else leaf[0]  # fewer numbers may be fewer tasks
+        for bad in (leaf[:, None], shorter, leaf + 0.5, leaf.astype(str)):
             leaves = list(jax.tree.leaves(tasks))
             leaves[index] = bad
             with pytest.raises(ValueError, match=r"must (have shape|hold)"):

@@ -74,7 +74,7 @@ def test_a_batch_equals_single_episodes(env, make_agent):
     lengths = np.asarray(together.trajectory.length)
     assert len(set(lengths)) > 3  # the comparison means something
     for index, length in enumerate(lengths):
-        for rows in (*together.trajectory[:-1], together.rewards):
+        for rows in (*together.trajectory.steps.values(), together.rewards):
             assert not np.asarray(rows[index, length:]).any()
 
 
@@ -158,6 +158,35 @@ def test_what_an_agent_decided_is_kept():
     episode = run_episode(jax.random.key(0), MAZE, counter, task)
     assert episode.trajectory.length == 5
     assert episode.decisions == {"asked": 6}
+
+
+def test_what_an_agent_intended_is_kept_beside_what_it_did():
+    """It means to count, executes 4 at every other step, and quits after five steps."""
+
+    def step(time):
+        return jnp.where(time % 2 == 0, 4, time), time >= 5, time
+
+    agent = Agent(
+        begin=lambda key, task, state, timestep: step(jnp.int32(0)),
+        proceed=lambda key, memory, state, timestep: step(memory + 1),
+        intended=lambda memory: memory,
+    )
+    task = MAZE.sample_task(jax.random.key(3))
+
+    def play(agent):
+        one = jax.jit(lambda key: run_episode(key, MAZE, agent, task))
+        return one(jax.random.key(0)).trajectory
+
+    trajectory, silent = play(agent), play(agent._replace(intended=None))
+    assert trajectory.actions[:6].tolist() == [4, 1, 4, 3, 4, 0]
+    assert trajectory.intended[:6].tolist() == [0, 1, 2, 3, 4, 0]
+    assert not np.asarray(trajectory.intended[5:]).any()
+    assert trajectory.intended.dtype == trajectory.actions.dtype
+    np.testing.assert_array_equal(trajectory.labels, trajectory.intended)
+    assert silent.intended is None
+    assert "intended" not in silent.steps
+    assert_trees_equal(silent, trajectory._replace(intended=None))
+    np.testing.assert_array_equal(silent.labels, silent.actions)
 
 
 def test_memory_grows_to_the_length_of_the_episode():

@@ -90,7 +90,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(root)
         patch.setattr(runtime, "configure", lambda: None)
-        patch.setattr(training, "GreedyEvaluation", Evaluation)
+        patch.setattr(training, "ReturnsOnTheWay", Evaluation)
         patch.delenv("MGPO_DATA", raising=False)
         assert call(FIRST) == 0
         first = read_policy(Path("first/policy"))
@@ -108,7 +108,7 @@ def here(runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     shutil.copytree(runs, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(runtime, "configure", lambda: None)
-    monkeypatch.setattr(training, "GreedyEvaluation", Evaluation)
+    monkeypatch.setattr(training, "ReturnsOnTheWay", Evaluation)
     monkeypatch.delenv("MGPO_DATA", raising=False)
     return tmp_path
 
@@ -195,7 +195,8 @@ def test_a_released_policy_of_an_older_version_is_known_by_its_network() -> None
     assert initial_at(PRETRAINED / "kitchen") == (
         {
             "max_prompt_length": 6, "prompt_order": True, "embed_dim": 128, "num_layers": 3,
-            "num_heads": 4, "encoder": "linear", "head": "binned", "standardize_obs": True,
+            "num_heads": 4, "encoder": "linear", "head": "binned", "tokens_per_step": 2,
+            "standardize_obs": True,
         },
         hash_file(PRETRAINED / "kitchen/weights.npz"),
     )  # fmt: skip
@@ -211,6 +212,8 @@ CONTRADICTIONS = {
     "--max-prompt-length 5": f"--max-prompt-length 5 {POLICY} max_prompt_length 3;",
     "--prompt-order": f"--prompt-order {POLICY} prompt_order False;",
     "--no-standardize-obs": f"--no-standardize-obs {POLICY} standardize_obs True;",
+    "--tokens-per-step 1": f"--tokens-per-step 1 {POLICY} tokens_per_step 2;",
+    "--encoder cells": f"--encoder cells {POLICY} encoder linear;",
     "--head gaussian": f"--head gaussian {POLICY} head categorical;",
 }
 

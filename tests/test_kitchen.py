@@ -19,7 +19,8 @@ from conftest import require_kitchen
 from jax.sharding import PartitionSpec
 
 import envs
-from envs.kitchen import MissingExtraError, NoOpenGLError, extra
+from envs.errors import MissingExtraError
+from envs.kitchen import NoOpenGLError, extra
 from envs.kitchen.demonstrators import kitchen_demonstrators
 from envs.kitchen.env import NONE, SUBTASKS, Kitchen, KitchenTask
 from envs.kitchen.fidelity import jit_for

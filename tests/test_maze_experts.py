@@ -275,7 +275,7 @@ class TestAStar:
         later = real[:, 1:]
         assert (trajectory.obs[:, 1:, :2][later] == trajectory.achieved_goals[:, :-1][later]).all()
         assert trajectory.goal_reached[real].all()
-        for rows in trajectory[:-1]:
+        for rows in trajectory.steps.values():
             assert (rows[~real] == 0).all()
 
     def test_length_statistics(self, astar15):

@@ -15,9 +15,9 @@ import pytest
 
 from envs.errors import NotAvailableError, UsageError
 from envs.maze.env import MazeRunner
-from envs.registry import Judgement
+from envs.registry import Judgement, World
 from envs.wrappers import Wrapper
-from mgpo_jax import methods
+from mgpo_jax import methods, runner
 from mgpo_jax.adaptation import Adapter
 from mgpo_jax.methods import (
     BBT,
@@ -43,6 +43,7 @@ from mgpo_jax.transformer import GoalTransformer, network_config
 
 ROOT = Path(__file__).parents[1]
 ENV = MazeRunner(name="tiny", side=7, horizon=6)
+WORLD = World(name="tiny", make=lambda: ENV)
 NETWORK = network_config(
     ENV.spec, max_prompt_length=3, embed_dim=8, num_layers=1, num_heads=1, dropout=0.0
 )
@@ -178,6 +179,41 @@ def test_built_in_names_are_taken(registry, name):
 def test_settings_of_another_method(method, name, says):
     with pytest.raises(UsageError, match=says):
         method.hyper_from({name: 1})
+
+
+def test_worlds_have_defaults_of_their_own(policy):
+    world = replace(WORLD, method_defaults={"ucb": {"scale": 3.0}, "bpe": {"keep_rewarded": False}})
+    assert UCB.hyper_in(world) == UcbHyper(scale=3.0)
+    assert UCB.hyper_in(world, {"c": 2.0, "scale": 1.0}) == UcbHyper(c=2.0, scale=1.0)
+    assert BPE.hyper_in(world) == BpeHyper(keep_rewarded=False)
+    assert BBT.hyper_in(world) == BbtHyper()
+    assert UCB.hyper_in(None) == UCB.hyper_in(WORLD) == UcbHyper()
+    wrong = replace(WORLD, method_defaults={"bbt": {"scale": 3.0}})
+    with pytest.raises(UsageError, match="--scale is no setting of bbt; it is one of ucb"):
+        BBT.hyper_in(wrong)
+
+
+def test_an_adaptation_starts_from_the_defaults_of_its_world(policy, monkeypatch):
+    class AskedError(Exception):
+        """Tells with which hyper-parameters an adaptation would run."""
+
+    def ask(env, policy, tasks, method, hypers, **options):
+        raise AskedError(hypers)
+
+    monkeypatch.setattr(runner, "sweep", ask)
+    world, tasks = (
+        replace(WORLD, method_defaults={"ucb": {"scale": 3.0}}),
+        sample_tasks(ENV, 0, 1),
+    )
+    for where, hyper, wanted in (
+        (world, None, UcbHyper(scale=3.0)),
+        (world, {"c": 2.0}, UcbHyper(scale=3.0, c=2.0)),
+        (world, UcbHyper(), UcbHyper()),
+        (ENV, None, UcbHyper()),
+    ):
+        with pytest.raises(AskedError) as asked:
+            adapt(where, policy, tasks, "ucb", hyper)
+        assert asked.value.args == ([wanted],)
 
 
 def test_hyper_parameters_from_a_dict():

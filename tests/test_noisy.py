@@ -12,7 +12,7 @@ import pytest
 from scipy import stats
 
 import envs
-from envs.base import ArraySpec, Box, Environment, EnvSpec, TimeStep
+from envs.base import ArraySpec, Box, Environment, EnvSpec, ObsLayout, TimeStep
 from envs.wrappers import Noisy
 
 MAZE = envs.make("maze15")
@@ -130,6 +130,19 @@ def test_refuses_what_is_no_noise():
         Noisy(Echo(), obs_range=(0.0, -1.0, 2.0))
     with pytest.raises(ValueError, match="of which echo has 3, found 2"):
         Noisy(Echo(), obs_range=(0.1, 0.1))
+
+
+def test_codes_take_no_noise():
+    @dataclass(frozen=True)
+    class Coded(Echo):
+        spec = replace(
+            Echo.spec,
+            layout=ObsLayout(num_cells=2, code_sizes=(3,), num_counts=1, max_count=4),
+        )
+
+    Noisy(Coded(), action_noise=0.1)
+    with pytest.raises(ValueError, match="needs amounts, those of echo are codes and counts"):
+        Noisy(Coded(), obs_noise=0.1)
 
 
 def test_whole_numbers_take_no_noise():

@@ -8,7 +8,7 @@ import subprocess
 import sys
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, get_origin
 
 import hypothesis.strategies as st
 import pytest
@@ -16,6 +16,7 @@ import tyro
 from hypothesis import given, settings
 
 from envs.errors import DataError, UsageError
+from envs.registry import WORLDS, find
 from experiments.adapt import adapt_default
 from experiments.evaluate import EvaluateConfig
 from experiments.parsing import parse
@@ -45,6 +46,18 @@ ROOT = Path(__file__).parents[1]
 
 def of_adapt(line: str) -> AdaptConfig:
     return parse(AdaptConfig, line.split(), adapt_default, prog="mgpo adapt")
+
+
+def test_a_world_may_have_defaults_for_a_method(monkeypatch, capsys):
+    own = replace(find("gridworld"), name="own", method_defaults={"ucb": {"scale": 3.0}})
+    monkeypatch.setitem(WORLDS._registered, "own", own)
+    assert of_adapt("--env own --c 2").hyper == UcbHyper(c=2.0, scale=3.0)
+    assert of_adapt("--env own --scale 1").hyper == UcbHyper(scale=1.0)
+    assert of_adapt("--env own --method bbt").hyper == BbtHyper()
+    assert of_adapt("--env gridworld").hyper == UcbHyper()
+    with pytest.raises(SystemExit):
+        of_adapt("--env own --help")
+    assert "default: 3.0" in " ".join(capsys.readouterr().out.split())
 
 
 def of_pretrain(line: str) -> PretrainConfig:
@@ -161,6 +174,8 @@ def test_a_recipe_is_never_mixed(words: list[str]):
         ("--head=", "unknown --head '' (known: categorical, gaussian,"),
         ("--head gausian", "unknown --head 'gausian'; did you mean 'gaussian'?"),
         ("--encoder liner", "unknown --encoder 'liner'; did you mean 'linear'?"),
+        ("--tokens-per-step 3", "unknown --tokens-per-step '3' (known: 2, 1)"),
+        ("--tokens-per-step one", "unknown --tokens-per-step 'one' (known: 2, 1)"),
         ("--optimizer moun", "unknown --optimizer 'moun'; did you mean 'muon'?"),
         ("--env=", "--env must not be empty, found ''"),
         ("--demonstrator=", "--demonstrator must not be empty, found ''"),
@@ -231,7 +246,8 @@ def test_every_number_has_a_range():
     for kind in (PretrainConfig, TrainConfig, AdaptConfig, CollectConfig, EvaluateConfig):
         for setting in fields(kind):
             default, known = setting.default, types_of(kind)[setting.name]
-            if isinstance(default, int | float) and not isinstance(default, bool):
+            chosen = get_origin(known) is Literal
+            if isinstance(default, int | float) and not isinstance(default, bool) and not chosen:
                 assert range_of(known), f"{kind.__name__}.{setting.name}"
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import envs
-from envs.base import ArraySpec, Box
+from envs.base import ArraySpec, Box, ObsLayout
 from envs.errors import DataError, UsageError
 from mgpo_jax.policy_files import load_policy, read_policy, save_policy
 from mgpo_jax.prompts import single_goal
@@ -26,6 +26,9 @@ from mgpo_jax.transformer import GoalTransformer, TransformerConfig, network_con
 
 SPEC = envs.make("maze15").spec
 CONFIG = network_config(SPEC, embed_dim=8, num_layers=1)
+
+
+LAYOUT = {"num_cells": 2, "code_sizes": [3, 2], "num_counts": 3, "max_count": 4}
 
 
 def params_of(config: TransformerConfig) -> dict:
@@ -71,6 +74,22 @@ def test_a_policy_in_any_folder(policy: Path) -> None:
         load_policy("maze30", str(policy))
 
 
+def test_a_layout_of_observations_comes_back(tmp_path: Path) -> None:
+    layout = ObsLayout(num_cells=2, code_sizes=(3, 2), num_counts=3, max_count=4)
+    spec = replace(SPEC, layout=layout)
+    config = network_config(
+        spec, embed_dim=8, num_layers=1, encoder="cells", tokens_per_step=1, num_heads=2
+    )
+    params = params_of(config)
+    save_policy(tmp_path / "policy", config, params, {})
+    loaded = read_policy(tmp_path / "policy", spec)
+    assert loaded.config == config
+    assert hash(loaded.config) == hash(config)
+    jax.tree.map(np.testing.assert_array_equal, loaded.params, params)
+    with pytest.raises(DataError, match=r"has obs_layout ObsLayout.*another world"):
+        read_policy(tmp_path / "policy", SPEC)
+
+
 def test_standardization_comes_back(tmp_path: Path, params: dict) -> None:
     size = SPEC.obs.size
     config = replace(
@@ -91,7 +110,7 @@ def test_standardization_comes_back(tmp_path: Path, params: dict) -> None:
         ({"obs_std": [0.0] * 6}, "network.obs_std.0 must be above 0, found 0.0"),
         ({"obs_std": [-1.0] * 6}, "network.obs_std.0 must be above 0, found -1.0"),
         ({"head": "gausian"}, "network.head must be one of .*mixture.*, found 'gausian'"),
-        ({"encoder": "lineal"}, "network.encoder must be one of linear, found 'lineal'"),
+        ({"encoder": "lineal"}, "network.encoder must be one of linear, cells, .*found 'lineal'"),
         ({"obs_dtype": "uint7"}, "network.obs_dtype must be one of .*uint8.*, found 'uint7'"),
         ({"obs_shape": "six"}, "network.obs_shape must be a list, found 'six'"),
         ({"obs_shape": 6}, "network.obs_shape must be a list, found 6"),
@@ -99,6 +118,28 @@ def test_standardization_comes_back(tmp_path: Path, params: dict) -> None:
         ({"dropout": True}, "network.dropout must be a number, found True"),
         ({"dropout": 1.5}, "network.dropout must be below 1, found 1.5"),
         ({"prompt_order": "yes"}, "network.prompt_order must be true or false, found 'yes'"),
+        ({"tokens_per_step": 3}, "network.tokens_per_step must be 2 or 1, found 3"),
+        ({"tokens_per_step": "1"}, "network.tokens_per_step must be 2 or 1, found '1'"),
+        ({"encoder": "cells"}, "network.obs_layout must not be null with encoder cells"),
+        ({"obs_layout": LAYOUT}, "network.obs_layout is of no use to encoder linear"),
+        ({"obs_layout": {"num_cells": 2}}, "lacks network.obs_layout.code_sizes"),
+        ({"obs_layout": {**LAYOUT, "more": 1}}, "has the unknown entry network.obs_layout.more"),
+        (
+            {"obs_layout": {**LAYOUT, "num_cells": "2"}},
+            "network.obs_layout.num_cells must be an integer, found '2'",
+        ),
+        (
+            {"obs_layout": {**LAYOUT, "num_cells": 4}, "encoder": "cells"},
+            r"network.obs_layout must describe a flat observation, found .* of shape \[6\]",
+        ),
+        (
+            {"obs_layout": {**LAYOUT, "max_count": -1}, "encoder": "cells"},
+            "network.obs_layout must hold no negative numbers and code sizes of at least 1",
+        ),
+        (
+            {"obs_layout": {**LAYOUT, "code_sizes": [10**12]}, "encoder": "cells"},
+            "network.obs_layout must have 1 to 1048576 codes and counts",
+        ),
         ({"num_heads": 3}, "network.num_heads must divide embed_dim 8, found 3"),
         ({"num_heads": 0}, "network.num_heads must be at least 1, found 0"),
         ({"num_heads": True}, "network.num_heads must be an integer, found True"),

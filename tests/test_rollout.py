@@ -111,7 +111,7 @@ def test_a_scripted_episode_is_recorded_exactly():
     np.testing.assert_allclose(trajectory.achieved_goals[:6] * 7, reached, atol=1e-5)
     np.testing.assert_array_equal(trajectory.outcomes, trajectory.achieved_goals)
     np.testing.assert_array_equal(trajectory.goal_reached, np.arange(12) < 6)
-    for rows in trajectory[:-1]:
+    for rows in trajectory.steps.values():
         assert rows.shape[0] == 12
         assert not np.asarray(rows[6:]).any()
 
@@ -172,7 +172,7 @@ def test_lanes_equal_single_runs():
     lengths = np.asarray(lanes.trajectory.length)
     assert len(set(lengths)) > 3  # the comparison means something
     for lane, length in enumerate(lengths):
-        for rows in lanes.trajectory[:-1]:
+        for rows in lanes.trajectory.steps.values():
             assert not np.asarray(rows[lane, length:]).any()
 
 

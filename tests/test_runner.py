@@ -23,7 +23,16 @@ from mgpo_jax.methods import GCBC, UCB, Method, NoHyper, UcbHyper
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.prompts import Prompt, single_goal
 from mgpo_jax.rollout import Query
-from mgpo_jax.runner import _lay_out, adapt, cache_bytes, evaluate, lanes_together, play, sweep
+from mgpo_jax.runner import (
+    _lay_out,
+    adapt,
+    cache_bytes,
+    evaluate,
+    evaluate_fully,
+    lanes_together,
+    play,
+    sweep,
+)
 from mgpo_jax.settings import NotNegative
 from mgpo_jax.tasks import sample_tasks, task_at
 from mgpo_jax.transformer import GoalTransformer, network_config
@@ -369,6 +378,42 @@ def test_the_episodes_that_judge_are_those_of_play(tasks):
             np.testing.assert_allclose(
                 episodes.return_.mean(), outcome.eval_returns[0, index, when], atol=1e-6
             )
+
+
+@dataclass(frozen=True)
+class Named(Wrapper):
+    """A world whose first goals have names."""
+
+    goal_names: tuple[str, ...] = ("one", "two", "three")
+
+
+def test_named_goals_are_counted_in_judging_episodes():
+    """By what the episodes have reached at their ends; everything else stays the same."""
+    policy, env, grid_tasks = untrained(GRID), Named(GRID), tasks_of(GRID)
+    judged = Judgement("sample", episodes=20)
+    options = {"seeds": 1, "episodes": 2, "eval_every": 2, "judged": judged}
+    outcome = adapt(env, policy, grid_tasks, "gcbc", **options)
+    plain = adapt(GRID, policy, grid_tasks, "gcbc", **options)
+    assert plain.eval_achieved is None
+    assert_same(outcome._replace(eval_achieved=None), plain)
+    assert outcome.eval_achieved.shape == (1, 3, 2, 3)
+    for index in range(3):
+        task = task_at(grid_tasks, index)
+        query = Query(single_goal(env.task_goal(task), 3), jnp.zeros((), bool))
+        lane_key = jax.random.split(jax.random.key(0), 3)[index]
+        for when in range(2):
+            played = play(jax.random.fold_in(lane_key, when), env, policy, task, query, 20)
+            last = played.trajectory.length - 1
+            ends = played.trajectory.outcomes[np.arange(20), last, :3]
+            np.testing.assert_allclose(
+                outcome.eval_achieved[0, index, when], (ends > 0.5).mean(axis=0), atol=1e-6
+            )
+    assert 0 < outcome.eval_achieved.mean() < 1
+    best = jax.tree.map(lambda leaf: leaf[:, :, -1], outcome.best)
+    again = evaluate_fully(env, policy, grid_tasks, best, episodes=20)
+    assert again.achieved.shape == (1, 3, 3)
+    np.testing.assert_allclose(again.achieved, outcome.eval_achieved[:, :, 0], atol=0.4)
+    assert evaluate_fully(GRID, policy, grid_tasks, best, episodes=2).achieved is None
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,9 @@ from hypothesis import given
 
 from envs.errors import UsageError
 from mgpo_jax.distributions import HEADS
-from mgpo_jax.encoders import ENCODERS
 from mgpo_jax.methods import METHODS, split_hyper
 from mgpo_jax.settings import (
     Count,
-    Encoder,
     Head,
     Name,
     NotNegative,
@@ -154,7 +152,6 @@ def test_a_usage_error_is_a_value_error():
 
 def test_names_that_need_jax_are_known_without_it():
     assert get_args(Head) == tuple(HEADS)
-    assert get_args(Encoder) == tuple(ENCODERS)
 
 
 def test_static_numbers_are_no_data():

@@ -14,7 +14,9 @@ from experiments.store.statistics import (
     MOST_PARTS,
     Interval,
     compare,
+    gain_over_tasks,
     interquartile_mean,
+    mean_log_success,
     paired_difference,
     part_shares,
     same_tasks,
@@ -195,6 +197,28 @@ def test_intervals_hold_the_truth_as_often_as_documented(
             for interval, true in zip(found, truth, strict=True)
         ]
     assert np.all((held / 300 >= least) & (held / 300 <= most)), held / 300
+
+
+def test_a_gain_is_paired_and_its_interval_over_tasks() -> None:
+    """As scipy's percentile bootstrap of the differences of tasks; seeds are only averaged."""
+    rng = np.random.default_rng(3)
+    tasks = rng.normal(0, 10, size=40)
+    b = tasks + rng.normal(size=(3, 40))
+    a = tasks + rng.normal(0.5, 1, size=(3, 40))
+    gain = gain_over_tasks(a, b)
+    each = a.mean(axis=0) - b.mean(axis=0)
+    wanted = bootstrap((each,), np.mean, n_resamples=20_000, method="percentile", rng=1)
+    assert gain.value == pytest.approx(each.mean())
+    assert gain[1:] == pytest.approx(tuple(wanted.confidence_interval), abs=0.03)
+    assert gain_over_tasks(a, b) == gain
+    assert gain_over_tasks(a[:, :1], b[:, :1]) == Interval(pytest.approx(each[0]), None, None)
+
+
+def test_the_score_of_crafter() -> None:
+    """Equal rates are their own score; a rate of 0 and one of 100 % give sqrt(101) - 1."""
+    assert mean_log_success(np.full(22, 0.3)) == pytest.approx(30)
+    assert mean_log_success(np.array([0.0, 1.0])) == pytest.approx(101**0.5 - 1)
+    assert mean_log_success(np.zeros(22)) == 0
 
 
 def test_scores_of_different_tasks_are_refused() -> None:

@@ -11,14 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from made_results import TINY, made_results
+from made_results import LUCKY, TINY, made_results
 from test_architecture import call_without_jax
 
 import envs.kitchen
-from envs.errors import DataError, UsageError
-from envs.kitchen import MissingExtraError
+from envs.errors import DataError, MissingExtraError, UsageError
 from envs.registry import WORLDS
-from experiments.store.results import Results, save_results
+from experiments.store.results import Results, load_results, save_results
 from experiments.store.rows import HEAD, Row, comparison, read_row
 from experiments.store.seals import check_replaceable, is_sealed, sealed, write_sealed
 from experiments.store.summary import printed, read_summary, solvable_tasks, summarize
@@ -458,6 +457,98 @@ def test_a_task_that_nobody_can_solve_never_counts_as_solved(tmp_path: Path, tin
     solved = summary_of(made_results())
     assert solved["unsolvable_tasks"] == 0
     assert "unsolvable" not in printed(solved)
+
+
+ACHIEVED = np.zeros((2, 2, 2, 2), np.float32)
+ACHIEVED[:, :, 0, 0], ACHIEVED[:, 0, 1, 0], ACHIEVED[..., 1] = 0.25, 0.5, 1.0
+
+
+@pytest.fixture
+def lucky(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """Results of a world that is judged by sampled actions and has names for its goals."""
+    monkeypatch.setitem(WORLDS._registered, "tiny", LUCKY)
+    return saved(tmp_path / "lucky", eval_achieved=ACHIEVED)
+
+
+def test_worlds_judged_by_sampling_have_a_lucky_and_a_fresh_return(lucky: Path) -> None:
+    summary = read_summary(lucky)
+    fresh = summary["fresh"]
+    assert (fresh["episodes"], summary["best_episode_return"]) == (4, -1.0)
+    # Of the four searches, -3, -1, -2 and -2 at first, -1, 0, -1 and 1 in the end.
+    assert fresh["gain"] == pytest.approx(1.75)
+    low, high = fresh["gain_95"] or (0, 0)
+    assert low == pytest.approx(1.5)
+    assert high == pytest.approx(2.0)
+    found = cells(read_row(lucky))
+    assert found["best single episode"] == "-1.00"
+    assert found["fresh"] == "-0.25 (4 sampled)"
+    assert found["fresh - initial [95 % over tasks]"] == "1.750 [1.500, 2.000]"
+    text = printed(summary)
+    assert re.search(r"fresh +-0\.250 \(the final return, of 4 sampled episodes", text)
+    assert re.search(r"minus initial +1\.750 \[1\.500, 2\.000\] \(95 % over tasks\)", text)
+    change(lucky / "summary.json", fresh={**fresh, "gain": 3.0})
+    with pytest.raises(DataError, match=r"gain is 3, by results\.npz it is 1\.75"):
+        read_row(lucky)
+
+
+def test_the_number_of_sampled_episodes_may_be_a_setting(lucky: Path) -> None:
+    results = load_results(lucky)
+    fewer = replace(results, config={**results.config, "eval_episodes": 2})
+    assert summary_of(fewer)["fresh"]["episodes"] == 2
+
+
+def test_named_goals_are_counted(lucky: Path) -> None:
+    np.testing.assert_array_equal(load_results(lucky).eval_achieved, ACHIEVED)
+    summary = read_summary(lucky)
+    assert summary["achieved"] == {"down": (0.25, 0.25), "right": (1.0, 1.0)}
+    found = cells(read_row(lucky))
+    assert found["goals achieved"] == "62.5 %"
+    assert found["score"] == f"{(26 * 101) ** 0.5 - 1:.2f}"
+    text = printed(summary)
+    assert re.search(r"score +50\.24 \(initially 50\.24\)", text)
+    assert re.search(r"down +25\.0 % \(initially 25\.0 %\)", text)
+    change(lucky / "summary.json", achieved={"down": [0.25, 0.3], "right": [1.0, 1.0]})
+    says = r"achieved is 0\.25, 0\.3, 1, 1, by results\.npz it is 0\.25, 0\.25, 1, 1"
+    with pytest.raises(DataError, match=says):
+        read_row(lucky)
+    change(lucky / "summary.json", achieved=...)
+    with pytest.raises(DataError, match="achieved is unknown"):
+        read_row(lucky)
+
+
+@pytest.mark.parametrize(
+    ("value", "says"),
+    [
+        ({}, "achieved must have at least 1 entries"),
+        ({"down": [0.5, 1.5]}, "achieved.down.1 must be at most 1, found 1.5"),
+        ({"down": [0.5]}, "achieved.down"),
+        ({"down": ["x", 0.5]}, "achieved.down.0 must be a number, found 'x'"),
+        ([0.5], r"achieved must be an object, found \[0.5\]"),
+    ],
+)
+def test_shares_that_are_none(lucky: Path, value: Any, says: str) -> None:
+    change(lucky / "summary.json", achieved=value)
+    with pytest.raises(DataError, match=says):
+        read_summary(lucky)
+
+
+def test_other_worlds_have_no_further_columns(tmp_path: Path, tiny: None) -> None:
+    folder = saved(tmp_path / "plain")
+    assert not {"fresh", "achieved"} & read_summary(folder).keys()
+    assert "eval_achieved" not in np.load(folder / "results.npz")
+    assert list(cells(read_row(folder))) == list(HEAD)
+
+
+def test_the_defaults_of_a_method_are_those_of_the_world(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    own = replace(TINY, method_defaults={"ucb": {"scale": 3.0}})
+    monkeypatch.setitem(WORLDS._registered, "tiny", own)
+    folder = saved(tmp_path / "own")
+    for scale, shown in ((3.0, {}), (1.0, {"scale": "1"})):
+        config = {"env": "tiny", "method": "ucb", "hyper": {"c": 1.0, "scale": scale}}
+        (folder / "config.json").write_text(json.dumps(config))
+        assert {k: v for k, v in read_row(folder).settings.items() if k != "policy"} == shown
 
 
 def test_cells_stay_cells() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +11,12 @@ import pytest
 
 import envs
 from envs.errors import DataError, UsageError
+from envs.registry import Judgement
 from envs.wrappers import Wrapper
+from experiments import training
 from experiments.datasets import find_demonstrator
-from experiments.training import GreedyEvaluation
+from experiments.training import ReturnsOnTheWay
+from mgpo_jax.optimizers.methods import judged_query
 from mgpo_jax.prompts import single_goal
 from mgpo_jax.released import released_folder
 from mgpo_jax.tasks import (
@@ -32,6 +35,7 @@ from mgpo_jax.tasks import (
 from mgpo_jax.transformer import GoalTransformer, network_config
 
 NUM = 50
+GREEDY = Judgement()
 
 
 def assert_trees_equal(a, b):
@@ -144,7 +148,7 @@ def test_tasks_of_foreign_tools_are_converted(tmp_path, dtype):
 
 
 @pytest.mark.parametrize(("name", "demonstrates"), [("gridworld", True), ("maze15", False)])
-def test_what_a_policy_makes_of_a_demonstration(name, demonstrates):
+def test_what_a_policy_makes_of_a_demonstration(name, demonstrates, monkeypatch):
     """Is measured where the demonstrator does the task at hand."""
     world = envs.find(name)
     env = world.make()
@@ -153,7 +157,17 @@ def test_what_a_policy_makes_of_a_demonstration(name, demonstrates):
     prompt = single_goal(env.task_goal(env.sample_task(jax.random.key(0))), 5)
     obs = jnp.zeros((2, *env.spec.obs.shape))
     params = GoalTransformer(config).init(jax.random.key(0), prompt, obs, jnp.zeros(2, jnp.int32))
-    found = GreedyEvaluation(world, env, config, demonstrator, 4)(params)
+    asked = []
+
+    def noted(prompt, judged):
+        asked.append(judged)
+        return judged_query(prompt, judged)
+
+    # Policies act there as the world judges them.
+    monkeypatch.setattr(training, "judged_query", noted)
+    world = replace(world, judged=Judgement("sample", 0.5, episodes=3) if demonstrates else GREEDY)
+    found = ReturnsOnTheWay(world, env, config, demonstrator, 4)(params)
+    assert set(asked) == {world.judged}
     assert ("eval/followed_return" in found) == demonstrates
     assert all(np.isfinite(value) for value in found.values())
     assert found["eval/initial_return"] < 0.9

@@ -195,6 +195,26 @@ def test_bc_loss_by_hand(loss_of, params):
     assert sums.num_steps == length
 
 
+def test_intended_actions_are_labels_and_executed_ones_the_history(loss_of, params):
+    length = 4
+    one = DATASET.gather(np.array([0]), np.array([length]), HORIZON)
+    one = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), one)
+    key = jax.random.key(5)
+    same = one._replace(intended=one.actions)
+    jax.tree.map(
+        np.testing.assert_array_equal, loss_of(params, key, same), loss_of(params, key, one)
+    )
+    noisy = one._replace(intended=(one.actions + 1) % 3)
+    nll, sums = loss_of(params, key, noisy)
+    key_prompt, _ = jax.random.split(key)
+    prompt = sample_prompt(key_prompt, one, hindsight_outcome(one), 3)
+    logits = jax.jit(GoalTransformer(NETWORK).apply)(params, prompt, one.obs, one.actions).logits
+    log_prob = special.log_softmax(np.asarray(logits, np.float64), axis=-1)
+    meant = np.asarray(noisy.intended)
+    np.testing.assert_allclose(nll, -sum(log_prob[t, meant[t]] for t in range(length)), rtol=1e-5)
+    assert sums.correct == (np.argmax(logits, axis=-1) == meant)[:length].sum()
+
+
 def test_bc_loss_ignores_padding(loss_of, params):
     one = DATASET.gather(np.array([0]), np.array([4]), HORIZON)
     one = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), one)

@@ -25,6 +25,7 @@ CONFIG = TransformerConfig(
     dropout=0.0,
 )
 GAUSSIAN = replace(CONFIG, head="gaussian")
+SUMMED = replace(CONFIG, tokens_per_step=1)
 
 
 def make_inputs(config, seed=0):
@@ -71,12 +72,18 @@ def test_standardized_observations():
 
 @pytest.fixture(scope="module")
 def params():
+    """The same for one token a step, whose weights have the same names and shapes."""
     return make_params(CONFIG)
 
 
+@pytest.fixture(scope="module", params=[2, 1], ids=["two tokens a step", "one token a step"])
+def config(request):
+    return replace(CONFIG, tokens_per_step=request.param)
+
+
 @pytest.fixture(scope="module")
-def full():
-    return jax.jit(make_full(CONFIG))
+def full(config):
+    return jax.jit(make_full(config))
 
 
 def changed_steps(before, after):
@@ -93,14 +100,16 @@ def test_the_past_does_not_see_the_future(params, full, t):
     np.testing.assert_array_equal(changed_steps(before, after), np.arange(t + 1, T))
 
 
-def test_gradients_are_causal():
-    params = make_params(GAUSSIAN)
-    prompt, obs, actions = make_inputs(GAUSSIAN)
+@pytest.mark.parametrize("tokens", [2, 1])
+def test_gradients_are_causal(tokens):
+    config = replace(GAUSSIAN, tokens_per_step=tokens)
+    params = make_params(config)
+    prompt, obs, actions = make_inputs(config)
 
     @jax.jit
     @lambda f: jax.jacrev(f, argnums=(0, 1, 2))
     def jacobians(goals, obs, actions):
-        return make_full(GAUSSIAN)(params, prompt._replace(goals=goals), obs, actions).mean(axis=-1)
+        return make_full(config)(params, prompt._replace(goals=goals), obs, actions).mean(axis=-1)
 
     goals, obs, actions = (
         np.abs(jac).max(axis=-1) > 0 for jac in jacobians(prompt.goals, obs, actions)
@@ -126,17 +135,53 @@ def test_appended_steps_have_no_influence(params, full):
     np.testing.assert_allclose(short, junk[:5], atol=1e-5)
 
 
+def test_one_token_a_step_is_the_sum_of_both_embeddings():
+    """Without blocks, the output at step t is a function of a_{t-1}, o_t and t alone."""
+    config = replace(SUMMED, num_layers=0)
+    params = make_params(config)
+    prompt, obs, actions = make_inputs(config)
+    weights = params["params"]
+
+    def dense(name, rows):
+        return rows @ weights[name]["kernel"] + weights[name]["bias"]
+
+    def norm(name, rows):
+        rows = (rows - rows.mean(-1, keepdims=True)) / np.sqrt(rows.var(-1, keepdims=True) + 1e-6)
+        return rows * weights[name]["scale"] + weights[name]["bias"]
+
+    done = dense("embed_action", np.eye(4)[np.asarray(actions)])
+    tokens = np.array(dense("embed_obs", obs) + weights["embed_time"])
+    tokens[1:] += done[:-1]
+    expected = dense("head", norm("norm_out", norm("norm_in", tokens)))
+    found = jax.jit(make_full(config))(params, prompt, obs, actions)
+    np.testing.assert_allclose(found[P:], expected, atol=1e-4)  # no block has left the goals out
+
+
+def test_the_number_of_tokens_of_some_steps():
+    assert [CONFIG.num_step_tokens(steps) for steps in (1, 2, 8)] == [1, 3, 15]
+    assert [SUMMED.num_step_tokens(steps) for steps in (1, 2, 8)] == [1, 2, 8]
+
+
+def test_one_token_a_step_needs_no_other_weights():
+    shapes = [jax.eval_shape(lambda c=c: make_params(c)) for c in (CONFIG, SUMMED)]
+    assert shapes[0] == shapes[1]
+
+
 @pytest.mark.parametrize(
-    ("head", "num_heads", "prompt_order"),
+    ("head", "num_heads", "prompt_order", "tokens"),
     [
-        ("categorical", 1, True),
-        ("categorical", 2, False),
-        ("gaussian", 1, False),
-        ("gaussian", 2, True),
+        ("categorical", 1, True, 2),
+        ("categorical", 2, False, 2),
+        ("gaussian", 1, False, 2),
+        ("gaussian", 2, True, 2),
+        ("categorical", 2, True, 1),
+        ("gaussian", 1, False, 1),
     ],
 )
-def test_prefill_and_decode_equal_the_full_pass(head, num_heads, prompt_order):
-    config = replace(CONFIG, head=head, num_heads=num_heads, prompt_order=prompt_order)
+def test_prefill_and_decode_equal_the_full_pass(head, num_heads, prompt_order, tokens):
+    config = replace(
+        CONFIG, head=head, num_heads=num_heads, prompt_order=prompt_order, tokens_per_step=tokens
+    )
     network = GoalTransformer(config)
     params = make_params(config)
 
@@ -151,10 +196,10 @@ def test_prefill_and_decode_equal_the_full_pass(head, num_heads, prompt_order):
         outputs = [jax.tree.map(lambda leaf: leaf[None], first)]
         # Room is made in unequal pieces, once more than is used.
         for start, end, room in ((1, 3, 2), (3, T, 6)):
-            cache = grow_cache(cache, 2 * room)
+            cache = grow_cache(cache, tokens * room)
             cache, more = jax.lax.scan(step, cache, (actions[start - 1 : end - 1], obs[start:end]))
             outputs.append(more)
-        assert cache.keys[0].shape[1] == P + 1 + 2 * (2 + 6)
+        assert cache.keys[0].shape[1] == P + 1 + tokens * (2 + 6)
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *outputs), cache.step
 
     inputs = [make_inputs(config, seed) for seed in range(3)]
@@ -168,12 +213,12 @@ def test_prefill_and_decode_equal_the_full_pass(head, num_heads, prompt_order):
 
 
 @pytest.mark.parametrize("block", [3, 5])
-def test_query_blocks_do_not_change_the_result(params, full, monkeypatch, block):
+def test_query_blocks_do_not_change_the_result(params, config, full, monkeypatch, block):
     inputs = make_inputs(CONFIG)
 
     monkeypatch.setattr(mgpo_jax.transformer, "QUERY_BLOCK", block)
     # A new function: the one compiled with whole blocks must not be used again.
-    in_blocks = jax.jit(make_full(CONFIG))(params, *inputs)
+    in_blocks = jax.jit(make_full(config))(params, *inputs)
     np.testing.assert_allclose(in_blocks, full(params, *inputs), atol=1e-5)
 
 
@@ -214,9 +259,9 @@ def test_sizes_of_table_6(horizon, head):
     assert 0.57e6 < count - horizon * config.embed_dim < 0.63e6
 
 
-def test_dropout_only_when_asked_for(params, full):
-    inputs = make_inputs(CONFIG)
-    network = GoalTransformer(replace(CONFIG, dropout=0.5))
+def test_dropout_only_when_asked_for(params, config, full):
+    inputs = make_inputs(config)
+    network = GoalTransformer(replace(config, dropout=0.5))
 
     @jax.jit
     def noisy(seed):

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from envs.kitchen.extra import MissingExtraError, NoOpenGLError, check_extra, import_mujoco
+from envs.kitchen.extra import NoOpenGLError, check_extra, import_mujoco
 from envs.registry import World
 
 if TYPE_CHECKING:
@@ -26,7 +26,6 @@ __all__ = [
     "KITCHEN_MJX",
     "KITCHEN_NATIVE",
     "KITCHEN_STOCK",
-    "MissingExtraError",
     "NoOpenGLError",
     "check_extra",
     "import_mujoco",

@@ -13,12 +13,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import ModuleType
 
+from envs.errors import MissingExtraError
+
 INSTALL = "pip install -e ."
 SCENE = Path("envs/assets/kitchen_franka/kitchen_assets/kitchen_env_model.xml")
-
-
-class MissingExtraError(ImportError):
-    """Packages that the kitchen needs are missing or do not fit together."""
 
 
 class NoOpenGLError(ImportError):

@@ -50,13 +50,16 @@ def learning_curve(results: Mapping[str, Results], title: str | None = None) -> 
 
 @styled
 def training_curve(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Losses of a training run and its greedy returns on the way, from the rows of ``metrics.jsonl``."""
+    """Losses of a training run and its returns on the way, from the rows of ``metrics.jsonl``.
+
+    The returns are of greedy or of sampled episodes, as the world judges policies.
+    """
     steps = [row["step"] for row in rows]
     figure = Figure(figsize=(6.4, 2.4), layout="constrained")
     panels = (
         ("loss", {"train/loss": "training", "val/loss": "held out"}),
         (
-            "greedy return",
+            "return",
             {
                 "eval/followed_return": "prompt of a demonstration",
                 "eval/initial_return": "initial prompt",

@@ -35,14 +35,14 @@ CARD = """# Multi-goal Transformer for {env}
 | data | {trajectories:,} demonstrations of {demonstrator}, seed {data_seed}{variants} |{begun}
 | training | {steps:,} steps of {batch_size} trajectories, {optimizer}, {cpu_minutes:.0f} CPU-minutes |
 | validation loss | {val_loss:.4f} nats an action, {correct} {val_accuracy:.4f} |
-| greedy return of the prompt (g^M) | {initial:.3f} on {eval_tasks} tasks of the training's own |
-| greedy return of a demonstration's prompt | {followed} |
+| {acting} return of the prompt (g^M) | {initial:.3f} on {eval_tasks} tasks of the training's own |
+| {acting} return of a demonstration's prompt | {followed} |
 
 Made by
 
     {command}
 
-![loss and greedy returns while training](training.png)
+![loss and {acting} returns while training](training.png)
 
 Files: `weights.npz`, `config.json` (network, SHA-256 of the weights, all settings), `tasks.npz` (the
 test tasks, in no dataset), `metrics.jsonl`. Results on them are in `results/` and the README.
@@ -138,6 +138,7 @@ def card(run: Finished) -> str:
         cpu_minutes=cpu_minutes(run.rows),
         val_loss=last["val/loss"],
         val_accuracy=last["val/accuracy"],
+        acting="greedy" if run.world.judged.mode == "greedy" else "sampled",
         initial=last["eval/initial_return"],
         followed=f"{last[FOLLOWED]:.3f} on the same tasks" if FOLLOWED in last else "-",
         correct="accuracy" if env.spec.discrete else f"share within {HIT} in all dimensions",

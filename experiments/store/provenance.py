@@ -17,7 +17,7 @@ from mgpo_jax.schema import STRICT, read_document
 
 PACKAGES = (
     "mgpo-jax", "jax", "jaxlib", "flax", "optax", "evosax", "numpy", "mujoco", "mujoco-mjx",
-    "gymnasium-robotics",
+    "gymnasium-robotics", "craftax",
 )  # fmt: skip
 
 

@@ -61,7 +61,7 @@ OLD_NAMES = {
 }
 AXES = {
     "S": "seed", "N": "task", "E": "episode", "R": "round", "P": "slot", "T": "step", "G": "number",
-    "C": "judgement", "L": "reached goal", "U": "different goal",
+    "C": "judgement", "L": "reached goal", "U": "different goal", "M": "named goal",
 }  # fmt: skip
 """Axes of the arrays by a letter, with their names in messages."""
 SIZES: Sizes = dict.fromkeys(("seed", "task", "episode", "round", "judgement"), range(1, 2**31))
@@ -77,6 +77,7 @@ FIELDS = {
     "returns": _field("SNE", "float32"),
     "eval_episodes": _field("C", "int64", low=1),
     "eval_returns": _field("SNC", "float32"),
+    "eval_achieved": _field("SNCM", "float32", required=False, low=0, high=1),
     "optimal_returns": _field("N", "float32", required=False),
     "task_goals": _field("NG", "float32", required=False),
     "num_parts": _field("N", "integers", required=False, low=0),
@@ -120,6 +121,9 @@ class Results:
     """[S, N, C] mean returns of the judging episodes, of which nothing else is kept."""
     optimal_returns: np.ndarray
     """[N]; NaN where the optimum is unknown."""
+    eval_achieved: np.ndarray | None = None
+    """[S, N, C, M] shares of the judging episodes that achieved each of the world's M named goals; None in
+    worlds without any."""
     lengths: np.ndarray | None = None
     """[S, N, E] steps of the episodes."""
     keys: np.ndarray | None = None
@@ -247,6 +251,7 @@ def results_of(
         eval_episodes=outcome.eval_episodes,
         eval_returns=outcome.eval_returns,
         optimal_returns=optimum,
+        eval_achieved=outcome.eval_achieved,
         lengths=outcome.lengths,
         keys=None if env.spec.deterministic else outcome.keys,
         actions=outcome.actions,
@@ -280,6 +285,8 @@ def write_results(place: Path, results: Results, folder: Path, meta: Mapping[str
     }
     if results.optimum_known:
         arrays["optimal_returns"] = results.optimal_returns
+    if results.eval_achieved is not None:
+        arrays["eval_achieved"] = results.eval_achieved
     if results.lengths is not None:
         arrays["lengths"] = results.lengths.astype(np.min_scalar_type(results.lengths.max()))
     if results.keys is not None:
@@ -399,6 +406,7 @@ def load_results(folder: Path, parts: Collection[str] = PARTS) -> Results:
         eval_episodes=arrays["eval_episodes"],
         eval_returns=arrays["eval_returns"],
         optimal_returns=np.full(num_tasks, np.nan) if optimum is None else optimum,
+        eval_achieved=arrays.get("eval_achieved"),
         lengths=arrays.get("lengths"),
         keys=arrays.get("keys"),
         actions=arrays.get("actions"),

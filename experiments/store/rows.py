@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +19,13 @@ from envs.registry import WORLDS, World
 from experiments.store.layout import ARRAYS, CONFIG, SUMMARY, TASKS
 from experiments.store.paper import paper_value
 from experiments.store.settings import AdaptConfig
-from experiments.store.statistics import Interval, PartShare, SeedSpread, part_shares
+from experiments.store.statistics import (
+    Interval,
+    PartShare,
+    SeedSpread,
+    mean_log_success,
+    part_shares,
+)
 from experiments.store.summary import (
     ADAPT_AGAIN,
     Summary,
@@ -135,7 +141,7 @@ def changed_settings(
     sha256 = summary.get("policy_sha256")
     if "policy" not in changed and sha256 not in (None, _released_sha256(world, sha256)):
         changed["policy"] = sha256[:12] if sha256 else ""
-    changed |= _changed_hyper(config, method_of(summary))
+    changed |= _changed_hyper(config, method_of(summary), world)
     return {shortened(name): _told(value) for name, value in changed.items()}
 
 
@@ -147,18 +153,21 @@ def _released_sha256(world: World | None, default: str | None) -> str | None:
     return json.loads(place.read_text())["sha256"]
 
 
-def _changed_hyper(config: Mapping[str, Any], method: str) -> dict[str, Any]:
-    """Hyper-parameters that differ from the method's defaults; of a place, all that are set."""
+def _changed_hyper(config: Mapping[str, Any], method: str, world: World | None) -> dict[str, Any]:
+    """Hyper-parameters that differ from the method's defaults in a world; of a place, all that are set."""
     hyper = config.get("hyper")
     if not isinstance(hyper, Mapping):  # the first version kept those of all methods together
         options = config.get("options")
         more = {name: config.get(name) for name in ("max_goals", "keep_rewarded")}
         hyper = {**options, **more} if isinstance(options, Mapping) else more
-    given = {name: value for name, value in hyper.items() if value is not None}
     if method not in METHODS.names():
-        return given
-    defaults = {f.name: f.default for f in dataclasses.fields(METHODS.find(method).hyper)}
-    return {n: value for n, value in given.items() if n in defaults and value != defaults[n]}
+        return {name: value for name, value in hyper.items() if value is not None}
+    defaults = dataclasses.asdict(METHODS.find(method).hyper_in(world))
+    return {
+        name: value
+        for name, value in hyper.items()
+        if name in defaults and value != defaults[name] and value is not None
+    }
 
 
 def _told(value: Any) -> str:
@@ -175,14 +184,47 @@ HEAD = (
 )  # fmt: skip
 
 
+FURTHER: Mapping[str, Callable[[Summary], str]] = {
+    "best single episode": lambda summary: f"{summary['best_episode_return']:.2f}",
+    "fresh": lambda summary: (
+        f"{summary['final_return']:.2f} ({summary['fresh']['episodes']} sampled)"
+    ),
+    "fresh - initial [95 % over tasks]": lambda summary: str(
+        Interval(summary["fresh"]["gain"], *(summary["fresh"]["gain_95"] or ()))
+    ),
+    "score": lambda summary: f"{mean_log_success(_achieved(summary)):.2f}",
+    "goals achieved": lambda summary: f"{100 * np.mean(_achieved(summary)):.1f} %",
+}
+"""Columns that only some worlds fill, by what stands above them."""
+
+
+def _achieved(summary: Summary) -> list[float]:
+    """Shares of the judged episodes that achieved each named goal under the optimized prompt."""
+    return [after for _, after in summary["achieved"].values()]
+
+
+def _further(name: str, summary: Summary) -> str:
+    """A cell of ``FURTHER``; empty where a summary has nothing to say."""
+    needed = "achieved" if name in ("score", "goals achieved") else "fresh"
+    return FURTHER[name](summary) if needed in summary else ""
+
+
 def comparison(rows: Sequence[Row]) -> str:
     """Adaptations beside the paper's Table 2, one row for each, in the order given.
 
-    Where a row has p_k, there are columns for them, which stay empty in the rows without.
+    Where a row has p_k or what else some worlds say, there are columns for it, which stay empty in the rows
+    without.
     """
+    further = [name for name in FURTHER if any(_further(name, row.summary) for row in rows)]
     num = max((len(row.summary.get("part_shares") or ()) for row in rows), default=0)
-    head = (*HEAD, *(f"p{k}" for k in range(1, num + 1)))
-    return table(head, [_cells(row) + _share_cells(row, num) for row in rows])
+    head = (*HEAD, *further, *(f"p{k}" for k in range(1, num + 1)))
+    return table(
+        head,
+        [
+            _cells(row) + [_further(name, row.summary) for name in further] + _share_cells(row, num)
+            for row in rows
+        ],
+    )
 
 
 def _share_cells(row: Row, num: int) -> list[str]:

@@ -27,7 +27,7 @@ from mgpo_jax.settings import (
     OF_WEIGHTS,
     RECIPE_NETWORK,
     Count,
-    Encoder,
+    EncoderName,
     Head,
     Name,
     NumEpisodes,
@@ -38,6 +38,7 @@ from mgpo_jax.settings import (
     NumTrajectories,
     Seed,
     Share,
+    TokensPerStep,
     TrainConfig,
     Width,
     check_contradictions,
@@ -63,7 +64,8 @@ class CollectConfig(Common):
     env: Name = DEFAULT_WORLD
     """The world, by name or as module:attribute (``python -m experiments.list`` shows the names)."""
     demonstrator: Annotated[Name | None, tyro.conf.arg(aliases=("--policy",))] = None
-    """Who demonstrates (default: the world's first demonstrator)."""
+    """Who demonstrates, in some worlds with settings changed, as in ``expert,drop=0.3`` (default: the
+    world's first demonstrator)."""
     trajectories: Annotated[NumTrajectories, tyro.conf.arg(aliases=("--episodes",))] = 10_000
     """Trajectories to keep."""
     seed: Seed = 0
@@ -85,7 +87,8 @@ class DataConfig:
     """Which dataset to train on."""
 
     demonstrator: Annotated[Name | None, tyro.conf.arg(aliases=("--policy",))] = None
-    """Who collects it (default: the world's first demonstrator)."""
+    """Who collects it, in some worlds with settings changed, as in ``expert,drop=0.3`` (default: the
+    world's first demonstrator)."""
     trajectories: Annotated[NumTrajectories, tyro.conf.arg(aliases=("--episodes",))] = 10_000
     """Trajectories to train on; they are collected first where they are not there yet."""
     data_seed: Seed = 0
@@ -116,8 +119,12 @@ class PretrainConfig(Common):
     """Transformer blocks [3]."""
     num_heads: Width = RECIPE_NETWORK["num_heads"]
     """Attention heads, which share the width of the network evenly [1]."""
-    encoder: Encoder = "linear"
-    """How observations become tokens [linear]."""
+    tokens_per_step: TokensPerStep = 2
+    """Tokens of a step: an observation and an action as 2, or the last action and the observation summed
+    as 1 [2]."""
+    encoder: EncoderName = "linear"
+    """How observations become tokens [linear]; ``cells`` embeds the codes and counts of worlds that have
+    them, other encoders come from one world and are for it."""
     head: Head | None = None
     """Distribution of actions; continuous ones have all but categorical (default: that of the preset, else
     the first that fits) [fixed_gaussian in the authors' code]."""
@@ -126,7 +133,7 @@ class PretrainConfig(Common):
     holdout: NumTrajectories = 200
     """Trajectories kept out of training for the validation loss."""
     eval_tasks: NumTasks = 64
-    """Tasks of the greedy evaluation on the way (no test tasks)."""
+    """Tasks of the evaluation on the way, an episode each (no test tasks)."""
     eval_every: Count = 1_000
     """Steps between evaluations."""
     save_every: Count = 500
@@ -313,10 +320,14 @@ def check_pretraining(config: PretrainConfig) -> None:
         raise UsageError(
             f"--batch-size {train.batch_size} is not a multiple of --part-size {train.part_size}"
         )
-    if config.init is not None:
-        if not goes_on(config):
-            check_initial(config)
-    elif config.embed_dim % config.num_heads:
+    if config.init is not None and not goes_on(config):
+        check_initial(config)
+    if config.standardize_obs and config.encoder != "linear":
+        raise UsageError(
+            f"--standardize-obs has no use with --encoder {config.encoder}, whose codes are no amounts; "
+            "leave it out"
+        )
+    if config.init is None and config.embed_dim % config.num_heads:
         raise UsageError(
             f"--embed-dim {config.embed_dim} is not a multiple of --num-heads {config.num_heads}"
         )

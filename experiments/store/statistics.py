@@ -154,6 +154,38 @@ def paired_difference(
     )
 
 
+def gain_over_tasks(
+    a: np.ndarray,
+    b: np.ndarray,
+    confidence: float = 0.95,
+    num_resamples: int = 2000,
+    seed: int = 0,
+) -> Interval:
+    """Mean of scores a minus mean of scores b, [S, N] each, on the same N tasks.
+
+    Tasks are paired and drawn anew, with the means over their seeds: the interval says how the difference
+    would vary on other tasks. One task has no interval.
+    """
+    each = a.mean(axis=0, dtype=np.float64) - b.mean(axis=0, dtype=np.float64)
+    rng = np.random.default_rng(seed)
+    resamples = each[rng.integers(len(each), size=(num_resamples, len(each)))].mean(axis=1)
+    return _percentile_interval(float(each.mean()), resamples, confidence, len(each))
+
+
+def mean_log_success(shares: Sequence[float] | np.ndarray) -> float:
+    """Crafter's score: the geometric mean of success rates in percent, each plus 1, minus 1.
+
+    Source: Hafner, *Benchmarking the Spectrum of Agent Capabilities*, ICLR 2022, section 3.2.
+
+    Args:
+      shares: [M] success rates from 0 to 1.
+
+    Returns:
+      A number from 0 to 100. Rare successes count more than in the mean.
+    """
+    return float(np.expm1(np.mean(np.log1p(100 * np.asarray(shares, np.float64)))))
+
+
 def _difference(a: np.ndarray, b: np.ndarray) -> float:
     return float(a.mean() - b.mean())
 
@@ -170,9 +202,10 @@ def _resampled(scores: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _percentile_interval(
-    value: float, resamples: Sequence[Any], confidence: float, num_seeds: int
+    value: float, resamples: Sequence[Any] | np.ndarray, confidence: float, num_drawn: int
 ) -> Interval:
-    if num_seeds < 2:
+    """The interval of what was drawn anew; there is none where that is a single seed or task."""
+    if num_drawn < 2:
         return Interval(value)
     tail = 50 * (1 - confidence)
     low, high = np.percentile(resamples, [tail, 100 - tail])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NotRequired
 
@@ -20,6 +20,8 @@ from experiments.store.statistics import (
     Interval,
     PartShare,
     SeedSpread,
+    gain_over_tasks,
+    mean_log_success,
     part_shares,
     seed_spread,
     stratified_bootstrap_iqm,
@@ -39,6 +41,7 @@ DECIDING = {
     "returns": ArrayField(("S", "N", "E"), "numbers"),
     "eval_episodes": ArrayField(("C",), "int64", low=1),
     "eval_returns": ArrayField(("S", "N", "C"), "numbers"),
+    "eval_achieved": ArrayField(("S", "N", "C", "M"), "numbers", required=False, low=0, high=1),
     "optimal_returns": ArrayField(("N",), "numbers", required=False),
     "num_parts": ArrayField(("N",), "integers", required=False, low=0),
 }
@@ -50,7 +53,20 @@ Tally = Annotated[int, Ge(0), Le(2**62)]
 Extent = Annotated[int, Ge(1), Le(2**62)]
 Amount = Annotated[float, Ge(0)]
 Fraction = Annotated[float, Ge(0), Le(1)]
+Shares = Annotated[dict[Label, tuple[Fraction, Fraction]], MinLen(1), MaxLen(1_000)]
 PartShares = Annotated[list[tuple[Fraction, Extent]], MinLen(1), MaxLen(MOST_PARTS)]
+
+
+@with_config(STRICT)
+class Fresh(TypedDict):
+    """What sampled episodes outside of the budget say of a search, in which the best return is luck."""
+
+    episodes: Extent
+    """How many a judged return is the mean of."""
+    gain: float
+    """``final_return`` minus ``initial_return``."""
+    gain_95: tuple[float, float] | None
+    """Its interval over tasks (``statistics.gain_over_tasks``); None for one task."""
 
 
 @with_config(STRICT)
@@ -83,6 +99,12 @@ class Summary(TypedDict):
     is the mean of several episodes: only that mean is kept, which does not tell the parts of each."""
     failed_episodes: Tally
     best_episode_return: float
+    """Return of the best single episode of the search, a matter of luck in worlds of chance."""
+    fresh: NotRequired[Fresh]
+    """Only of worlds whose policies are judged by sampled actions."""
+    achieved: NotRequired[Shares]
+    """In worlds with named goals: by the name of each, the share of the judged episodes that achieved it
+    under the initial and under the optimized prompt."""
     cpu_seconds: Amount
     episodes_per_cpu_second: Amount
 
@@ -109,6 +131,8 @@ def summarize(
         **_of_judgements(results.eval_returns),
         **_against_optimum(results.eval_episodes, results.eval_returns, optimum, solvable),
         "part_shares": part_shares(final, results.num_parts) if single else None,
+        **_of_sampling(results),
+        **_of_named_goals(results),
         "failed_episodes": num_failed,
         "cpu_seconds": cpu_seconds,
         "episodes_per_cpu_second": num_episodes / cpu_seconds,
@@ -136,6 +160,34 @@ def _of_judgements(eval_returns: np.ndarray) -> dict[str, Any]:
         "final_return_iqm": iqm.value,
         "final_return_iqm_95": None if iqm.low is None else [iqm.low, iqm.high],
     }
+
+
+def _of_sampling(results: Results) -> dict[str, Any]:
+    """The entry ``fresh`` of a summary, in worlds that judge by sampled actions; elsewhere nothing."""
+    judged = results.world.judged
+    if judged.mode != "sample":
+        return {}
+    episodes = results.config.get("eval_episodes") or judged.episodes
+    return {"fresh": {"episodes": episodes, **_gain(results.eval_returns)}}
+
+
+def _gain(eval_returns: np.ndarray) -> dict[str, Any]:
+    """How much better the last of the judged returns [S, N, C] are than the first."""
+    gain = gain_over_tasks(eval_returns[:, :, -1], eval_returns[:, :, 0])
+    return {"gain": gain.value, "gain_95": None if gain.low is None else [gain.low, gain.high]}
+
+
+def _of_named_goals(results: Results) -> dict[str, Any]:
+    """The entry ``achieved`` of a summary, in worlds whose goals have names; elsewhere nothing."""
+    if results.eval_achieved is None:
+        return {}
+    shares = _first_and_last(results.eval_achieved).tolist()
+    return {"achieved": dict(zip(results.world.make().goal_names, shares, strict=True))}
+
+
+def _first_and_last(achieved: np.ndarray) -> np.ndarray:
+    """[M, 2]: from shares [S, N, C, M], those of the first and of the last judgement."""
+    return achieved[:, :, [0, -1]].mean(axis=(0, 1)).T
 
 
 def judged_once(config: Mapping[str, Any], world: World | None) -> bool | None:
@@ -248,6 +300,13 @@ def check_against(path: Path, summary: Summary, single: bool | None) -> None:
         known = "num_parts" in arrays and single is not False
         shares = part_shares(judged[:, :, -1], arrays["num_parts"]) if known else None
         expected["part_shares"] = None if single is None and not found["part_shares"] else shares
+    if fresh := summary.get("fresh"):
+        found |= fresh
+        expected |= _gain(judged)
+    if "achieved" in summary or "eval_achieved" in arrays:
+        of_goals = arrays.get("eval_achieved")
+        found["achieved"] = list(summary.get("achieved", {}).values()) or None
+        expected["achieved"] = None if of_goals is None else _first_and_last(of_goals)
     for name, value in expected.items():
         if not _agree(found[name], value):
             raise DataError(
@@ -267,6 +326,48 @@ def _told(value: Any) -> str:
     if value is None:
         return "unknown"
     return ", ".join(f"{part:.6g}" for part in np.ravel(value))
+
+
+def _rows_of_sampling(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The printed lines on sampled episodes, as label and text; none in worlds that judge greedily."""
+    if not (fresh := summary.get("fresh")):
+        return []
+    gain = Interval(fresh["gain"], *(fresh["gain_95"] or ()))
+    return [
+        (
+            "best single episode",
+            f"{summary['best_episode_return']:.3f} (of the search: luck included)",
+        ),
+        (
+            "fresh",
+            f"{summary['final_return']:.3f} (the final return, of {fresh['episodes']} sampled episodes "
+            "outside of the search)",
+        ),
+        ("  minus initial", f"{gain}{' (95 % over tasks)' if gain.low is not None else ''}"),
+    ]
+
+
+def _rows_of_named_goals(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The printed lines on named goals, as label and text; none in worlds without names."""
+    if not (achieved := summary.get("achieved")):
+        return []
+    first, last = zip(*achieved.values(), strict=True)
+    return [
+        ("score", f"{mean_log_success(last):.2f} (initially {mean_log_success(first):.2f})"),
+        ("goals achieved", f"{_of_all(last)} of {len(last)} (initially {_of_all(first)})"),
+        *(
+            (f"  {name}", f"{_percent(after)} (initially {_percent(before)})")
+            for name, (before, after) in achieved.items()
+        ),
+    ]
+
+
+def _of_all(shares: Sequence[float]) -> str:
+    return _percent(float(np.mean(shares)))
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %"
 
 
 def printed(summary: Mapping[str, Any]) -> str:
@@ -291,6 +392,7 @@ def printed(summary: Mapping[str, Any]) -> str:
     if shares := summary.get("part_shares"):
         rows.append(("parts in order", "share with the first k done (tasks x seeds that have k)"))
         rows += [(f"  p{k}", str(PartShare(*pair))) for k, pair in enumerate(shares, 1)]
+    rows += _rows_of_sampling(summary) + _rows_of_named_goals(summary)
     if unsolvable := summary.get("unsolvable_tasks"):
         rows.append(
             (

@@ -35,10 +35,11 @@ FLAGS_SHARE = 0.35  # of all cases have a sound input and a command line that is
 NETWORK = (
     "network.obs_shape.*", "network.goal_dim", "network.action_dim", "network.horizon",
     "network.max_prompt_length", "network.embed_dim", "network.num_layers", "network.num_heads",
+    "network.tokens_per_step",
 )  # fmt: skip
 POLICY = JsonTraits(
     checked=("format", "sha256", "network", "network.*", "made"),
-    required=("format", "sha256", "network", "network.obs_shape", *NETWORK[1:]),
+    required=("format", "sha256", "network", "network.obs_shape", *NETWORK[1:-1]),
     positive=NETWORK,
     shares=("network.dropout",),
     names=("sha256", "network.head", "network.encoder", "network.obs_dtype"),
@@ -55,7 +56,7 @@ RESULT_CONFIG = JsonTraits(
 )
 RESULT_ARRAYS = NpzTraits(
     required=("returns", "eval_episodes", "eval_returns", "best.prompt.*", "choice.prompt.*"),
-    bounded=("eval_episodes", "reached_index", "reached_counts", "*returns"),
+    bounded=("eval_episodes", "eval_achieved", "reached_index", "reached_counts", "*returns"),
     free=("*.prompt.goals",),
 )
 MAZES = NpzTraits(required=("*",), bounded=("maze", "goal"))
@@ -66,6 +67,7 @@ RUN_CONFIG = JsonTraits(
     positive=(
         "train.steps", "train.batch_size", "train.part_size", "train.part_steps", "train.bucket",
         "data.trajectories", "embed_dim", "num_layers", "num_heads", "max_prompt_length",
+        "tokens_per_step",
     ),
     names=("env", "train.optimizer", "train.schedule", "encoder"),
     closed=(".", "data", "train"),
@@ -75,11 +77,13 @@ RUN_CONFIG = JsonTraits(
 SUMMARY = JsonTraits(
     checked=("*",),
     required=("env", "num_tasks", "num_seeds", "num_episodes", "initial_return", "final_return"),
-    positive=("num_tasks", "num_seeds", "num_episodes"),
-    shares=("solved_optimally",),
+    positive=("num_tasks", "num_seeds", "num_episodes", "fresh.episodes"),
+    shares=("solved_optimally", "achieved.*"),
     names=("env", "method"),
+    closed=("fresh",),
     nullable=("optimal_return", "regret", "regret_*", "solved_optimally", "method", "optimizer",
-              "policy_sha256", "final_return_std_over_seeds", "final_return_iqm*", "part_shares"),
+              "policy_sha256", "final_return_std_over_seeds", "final_return_iqm*", "part_shares",
+              "fresh.gain_95"),
     texts=("policy_sha256",),
 )  # fmt: skip
 MANIFEST = JsonTraits(
@@ -99,7 +103,7 @@ MANIFEST = JsonTraits(
 )
 TRAJECTORIES = NpzTraits(
     required=("obs", "actions", "achieved_goals", "goal_reached", "outcomes", "lengths"),
-    bounded=("actions", "lengths", "obs", "achieved_goals", "outcomes"),
+    bounded=("actions", "intended", "lengths", "obs", "achieved_goals", "outcomes"),
     hash_in=("manifest.json", "sha256"),
 )
 

@@ -29,6 +29,9 @@ ZERO_IS_FINE = {
 }  # fmt: skip
 """Numbers of these flags count from 0."""
 
+OF_THE_WORLD = {"head", "encoder"}
+"""Flags of which a world may refuse choices that others take."""
+
 OUTPUTS = {"out", "json"}
 """Flags that name what is written."""
 
@@ -79,6 +82,10 @@ CONTRADICTIONS: dict[str, tuple[tuple[str, str], ...]] = {
         ("--init policy --no-prompt-order", "--no-prompt-order"),
         ("--init policy --standardize-obs", "--standardize-obs"),
         ("--init policy --env gridworld", "policy"),
+        ("--init policy --tokens-per-step 1", "--tokens-per-step"),
+        ("--encoder cells", "--encoder"),
+        ("--encoder cells --standardize-obs", "--standardize-obs"),
+        ("--tokens-per-step 3", "--tokens-per-step"),
         ("--init result", "result"),
     ),
     "adapt": (
@@ -289,7 +296,11 @@ def _bad_values(flag: Flag) -> list[tuple[str, Expected]]:
     if float in numbers:
         values += [("-0.5", "refused"), ("1e38", "either"), ("1e-400", "either")]
     if flag.choices:
-        values += [("nonsense", "refused"), (flag.choices[0].upper(), "refused"), ("", "refused")]
+        values += [
+            ("nonsense", "refused"),
+            (f"{flag.choices[0].upper()}X", "refused"),
+            ("", "refused"),
+        ]
     elif str in flag.kinds and not numbers:
         # What is named on the command line may be imported, and no word of it can hold a zero byte.
         names = [name for name in NAMES if ":" not in name and "\x00" not in name]
@@ -442,6 +453,7 @@ def _contradiction(rng: np.random.Generator, command: str) -> Case:
 def _valid(rng: np.random.Generator, command: str) -> Case:
     """A sound command line, with further words that are right."""
     words = base_words(command)
+    expected: Expected = "accepted"
     texts = VALID.get(command, ())
     if texts and rng.random() < 0.5:
         added = pick(rng, texts).split()
@@ -460,11 +472,12 @@ def _valid(rng: np.random.Generator, command: str) -> Case:
         flag, beside = pick(rng, simple)
         value = pick(rng, flag.choices) if flag.choices else repr(flag.default)
         added = [*beside, pick(rng, flag.spellings[:2]), value]
+        expected = "either" if flag.name in OF_THE_WORLD else "accepted"
     given = {word.split("=")[0] for word in added if word.startswith("--")}
     for flag, _ in all_flags(command):
         if given & set(flag.spellings):
             words = without_flag(words, flag)
-    return _case(command, [*words, *added], "accepted")
+    return _case(command, [*words, *added], expected)
 
 
 WAYS = ((_one_bad_value, 7), (_odd_line, 2), (_contradiction, 2), (_valid, 2))

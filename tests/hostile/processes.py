@@ -384,7 +384,7 @@ def _stay(answer: socket.socket) -> NoReturn:
     """Run one command line after another."""
     from experiments import training
 
-    for name in ("Trainer", "GreedyEvaluation"):
+    for name in ("Trainer", "ReturnsOnTheWay"):
         _remember(training, name)
     while True:
         message, files, *_ = socket.recv_fds(answer, 1 << 16, 2)

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import fcntl
 import importlib
+import json
 import os
 import shutil
 from contextlib import chdir
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 
+from .grammar_npz import read
 from .work import EVALUATION, replaced
 
 NUM_TASKS = 2
@@ -18,6 +21,7 @@ PRETRAIN = (
     "--preset smoke --trajectories 40 --holdout 8 --embed-dim 8 --num-layers 1 --batch-size 8 "
     "--part-size 4 --bucket 64 --eval-tasks 2 --steps 4 --save-every 2 --eval-every 2 --out run"
 )
+COLLECT = "--trajectories 40"
 ADAPT = (
     "--policy policy --tasks tasks.npz --seeds 1 --episodes 4 --eval-every 2 --eval-episodes 1 "
     "--no-figures --out result"
@@ -49,12 +53,42 @@ def make(folder: Path) -> Path:
     return folder
 
 
+def _collect_with_noise() -> None:
+    """The dataset of the runs, as if its demonstrator had told what it intended."""
+    run("collect", COLLECT)
+    (folder,) = Path("data/maze15").iterdir()
+    path, manifest = folder / "trajectories.npz", folder / "manifest.json"
+    arrays = read(path)
+    np.savez_compressed(path, allow_pickle=False, **arrays, intended=arrays["actions"])
+    document = json.loads(manifest.read_text())
+    document["sha256"] = sha256(path.read_bytes()).hexdigest()
+    manifest.write_text(json.dumps(document))
+
+
+def _judge_by_sampling(folder: Path) -> None:
+    """Make a result as if its world judged by sampled actions and had names for two goals."""
+    from experiments.store.statistics import gain_over_tasks
+
+    arrays = read(folder / "results.npz")
+    returns = arrays["eval_returns"]
+    achieved = np.full((*returns.shape, 2), 0.5, np.float32)
+    np.savez_compressed(
+        folder / "results.npz", allow_pickle=False, **arrays, eval_achieved=achieved
+    )
+    gain, *interval = gain_over_tasks(returns[:, :, -1], returns[:, :, 0])
+    summary = json.loads((folder / "summary.json").read_text())
+    summary["fresh"] = {"episodes": 1, "gain": gain, "gain_95": interval}
+    summary["achieved"] = {"one": [0.5, 0.5], "two": [0.5, 0.5]}
+    (folder / "summary.json").write_text(json.dumps(summary))
+
+
 def _make() -> None:
     """Everything, in the current folder."""
     from mgpo_jax.tasks import test_tasks
     from mgpo_jax.trees import named_leaves
 
     os.environ.pop("MGPO_DATA", None)
+    _collect_with_noise()
     with replaced(EVALUATION):
         run("pretrain", PRETRAIN)
     shutil.copytree("run/policy", "policy")
@@ -67,6 +101,7 @@ def _make() -> None:
     arrays = {name: np.asarray(leaf)[:NUM_TASKS] for name, leaf in leaves.items()}
     np.savez_compressed("tasks.npz", allow_pickle=False, **arrays)
     run("adapt", ADAPT)
+    _judge_by_sampling(Path("result"))
     shutil.copytree("result", "old/maze15/table4/K1-1seeds")
     Path("file.txt").write_text("a file\n")
     Path("trap.py").write_text(TRAP)

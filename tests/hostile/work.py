@@ -30,14 +30,14 @@ class Evaluation:
         return {"eval/initial_return": -1.0, "eval/initial_regret": 0.5}
 
 
-EVALUATION = ("experiments.training", "GreedyEvaluation", Evaluation)
+EVALUATION = ("experiments.training", "ReturnsOnTheWay", Evaluation)
 PLACES: tuple[tuple[str, str, Any], ...] = (
     ("experiments.runtime", "configure", lambda: None),
     ("experiments.datasets", "program_of", begin),
     EVALUATION,
     ("mgpo_jax.training", "Trainer.step", begin),
     ("mgpo_jax.runner", "_lay_out", begin),
-    ("experiments.evaluation", "evaluate", begin),
+    ("experiments.evaluation", "evaluate_fully", begin),
     ("experiments.checking", "officials_of", lambda cases: ()),  # mazes have no official program
     ("experiments.checking", "compare", begin),
     ("experiments.drawing", "write", begin),
