@@ -1,0 +1,130 @@
+"""Crafter: 22 achievements in generated worlds. Nothing here imports jax or craftax."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from envs.crafter.extra import check_extra
+from envs.registry import Encoder, Judgement, World
+
+if TYPE_CHECKING:
+    from flax.linen import Module
+
+    from envs.base import Demonstrator, ObsLayout
+    from envs.crafter.env import Crafter
+    from envs.drawing import Pictures
+
+__all__ = [
+    "CRAFTER",
+    "CRAFTER_MAP",
+    "CRAFTER_SYMBOLIC",
+    "PICTURE",
+    "check_extra",
+]
+
+HORIZON = 500
+
+
+def make(name: str = "crafter-symbolic", places: bool = False) -> Crafter:
+    """Crafter. With ``places``, goals say where their achievements were unlocked.
+
+    Raises:
+      MissingExtraError: if craftax is missing or too old.
+    """
+    check_extra()  # complains now and not in the middle of a program
+    from envs.crafter.env import Crafter
+
+    return Crafter(name=name, horizon=HORIZON, places=places)
+
+
+def make_seen() -> Crafter:
+    return make("crafter")
+
+
+def make_map() -> Crafter:
+    return make("crafter-map", places=True)
+
+
+def load_demonstrators(env: Crafter) -> Mapping[str, Demonstrator]:
+    from envs.crafter.demonstrators import crafter_demonstrators
+
+    return crafter_demonstrators(env)
+
+
+def load_pictures(env: Crafter) -> Pictures:
+    from envs.crafter.pictures import crafter_pictures
+
+    return crafter_pictures(env)
+
+
+def make_encoder(obs_shape: tuple[int, ...], width: int, layout: ObsLayout | None) -> Module:
+    """The linear layer on Crafter's picture of the codes.
+
+    Raises:
+      MissingExtraError: if Crafter's textures are missing.
+    """
+    check_extra()
+    from envs.crafter.encoding import Picture
+
+    return Picture(width)
+
+
+def encoder_fault(layout: ObsLayout, shape: tuple[int, ...]) -> str | None:
+    """What is wrong with observations that are to be Crafter's codes and nothing else."""
+    check_extra()
+    from envs.crafter.view import LAYOUT, OBS_SIZE
+
+    if layout != LAYOUT:
+        return f"must be that of Crafter's codes, found {layout}"
+    if shape != (OBS_SIZE,):
+        return f"must be of {OBS_SIZE} numbers, all that a picture shows, found {list(shape)}"
+    return None
+
+
+PICTURE = Encoder(name="crafter-picture", make=make_encoder, uses_layout=True, fault=encoder_fault)
+
+PRESETS = {
+    # As many goals as there are achievements, and the task goal.
+    "fast": {
+        "steps": 8_000,
+        "trajectories": 12_000,
+        "batch_size": 16,
+        "part_steps": 2_048,
+        "max_prompt_length": 23,
+        "bucket": 32,
+        "tokens_per_step": 1,
+    },
+    "paper": {"steps": 50_000, "trajectories": 2_000, "max_prompt_length": 23, "bucket": 32},
+}
+
+CRAFTER_SYMBOLIC = World(
+    name="crafter-symbolic",
+    make=make,
+    summary="22 achievements in a generated world, seen as the codes of what is in view",
+    demonstrators=load_demonstrators,
+    presets={name: {**preset, "encoder": "cells"} for name, preset in PRESETS.items()},
+    pictures=load_pictures,
+    # Greedy actions repeat themselves and get stuck. Returns vary with what mobs do.
+    judged=Judgement(mode="sample", temperature=1.0, episodes=16),
+    # About the standard deviation of the returns of one prompt. The default unit, the range of all returns
+    # (22.9), would explore seven times as much.
+    method_defaults={"ucb": {"scale": 3.0}},
+)
+
+CRAFTER_MAP = replace(
+    CRAFTER_SYMBOLIC,
+    name="crafter-map",
+    make=make_map,
+    summary="crafter-symbolic, where goals also say at which place their achievements were unlocked",
+)
+
+CRAFTER = replace(
+    CRAFTER_SYMBOLIC,
+    name="crafter",
+    make=make_seen,
+    summary="crafter-symbolic for policies that see Crafter's picture of 64 x 64 pixels",
+    # What is recorded is what the picture is drawn from; the encoder makes the picture of it.
+    presets={name: {**preset, "encoder": "crafter-picture"} for name, preset in PRESETS.items()},
+)

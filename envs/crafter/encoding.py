@@ -1,0 +1,167 @@
+"""The encoder ``crafter-picture``: a linear layer on Crafter's picture that does not draw it.
+
+A picture is a tile for each cell and an icon for each item, all of which stand at fixed places. What a
+linear layer makes of it is the sum of what it makes of each tile at its place, and that is looked up. Night
+mixes the tiles of day and night by the light, and sleep makes them gray, both of which are linear in the
+tiles. Only Crafter's rounding to bytes by night and asleep is left out, less than one and a half of 255.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from envs.crafter.tiles import (
+    GRAY,
+    ITEM_ROWS,
+    ITEMS,
+    PIXELS,
+    SLEEP,
+    UNIT,
+    night_tiles,
+    tiles,
+)
+from envs.crafter.view import (
+    ASLEEP,
+    COLUMNS,
+    COUNTS,
+    LIGHT,
+    MAX_COUNT,
+    NUM_BLOCKS,
+    NUM_CELLS,
+    NUM_CODES,
+    NUM_COUNTS,
+    NUM_FACINGS,
+    ROWS,
+)
+
+LEVELS = 255.0  # brightness is between 0 and 1
+MIDDLE = NUM_CELLS // 2  # where the agent stands
+TILE = UNIT * UNIT * 3  # numbers of a tile
+
+
+class Shown(NamedTuple):
+    """Which tile each of some observations shows at one cell, and in which light."""
+
+    row: Int[Array, "*batch"]
+    """The number of the tile."""
+    light: Float[Array, "*batch 1"]
+    """From 0 by night to 1 by day."""
+    asleep: Int[Array, "*batch"]
+    """1 if the agent sleeps, which makes tiles gray, else 0."""
+
+
+class Picture(nn.Module):
+    """A linear layer on the picture of 64 x 64 pixels of an observation of codes.
+
+    Attributes:
+      width: size of a token.
+    """
+
+    width: int
+
+    @nn.compact
+    def __call__(self, obs: Float[Array, "... 85"]) -> Float[Array, "..."]:
+        """Tokens ``[*batch, E]`` of observations; codes and counts are rounded into their range."""
+        shape = (PIXELS, PIXELS, 3, self.width)
+        init = nn.initializers.lecun_normal(in_axis=(0, 1, 2), out_axis=3)
+        kernel = self.param("kernel", init, shape)
+        bias = self.param("bias", nn.initializers.zeros_init(), (self.width,))
+        places = by_place(kernel)
+        view, items = places[:NUM_CELLS], places[NUM_CELLS:]
+        asleep = obs[..., ASLEEP, None] > 0.5
+        token = bias + jnp.where(asleep, _sleep_offset(view), 0.0)
+        kernels = jnp.stack([view, gray_kernel(view)])
+        token = _with_cells(token, kernels, obs)
+        return _with_items(token, items, obs)
+
+
+def by_place(kernel: Float[Array, "64 64 3 E"]) -> Float[Array, "places TILE E"]:
+    """The weights of each cell of the view and of each item below it, row by row."""
+    width = kernel.shape[-1]
+    used = kernel[: (ROWS + ITEM_ROWS) * UNIT, : COLUMNS * UNIT]
+    apart = used.reshape(ROWS + ITEM_ROWS, UNIT, COLUMNS, UNIT, 3, width)
+    return apart.swapaxes(1, 2).reshape((ROWS + ITEM_ROWS) * COLUMNS, TILE, width)
+
+
+def gray_kernel(places: Float[Array, "places TILE E"]) -> Float[Array, "places TILE E"]:
+    """Weights that make of colors what ``places`` make of half their gray."""
+    pixels = places.reshape(len(places), -1, 3, places.shape[-1])
+    share = jnp.asarray(GRAY / GRAY.sum(), jnp.float32)[:, None]
+    return (0.5 * share * pixels.sum(axis=2, keepdims=True)).reshape(places.shape)
+
+
+def _sleep_offset(places: Float[Array, "places TILE E"]) -> Float[Array, "E"]:
+    """What the tint of sleep adds to a token."""
+    pixels = places.reshape(-1, 3, places.shape[-1]).sum(axis=0)
+    return jnp.asarray(0.5 * SLEEP / LEVELS, jnp.float32) @ pixels
+
+
+def _with_cells(
+    token: Float[Array, "*batch E"],
+    kernels: Float[Array, "2 63 TILE E"],
+    obs: Float[Array, "*batch 85"],
+) -> Float[Array, "*batch E"]:
+    """The token plus what the cells in view look like, with weights for being awake and asleep.
+
+    Cell by cell: what all cells look like at once would fill the memory.
+    """
+    codes = jnp.clip(jnp.round(obs[..., :NUM_CELLS]), 0, NUM_CODES - 1).astype(jnp.int32)
+    asleep = (obs[..., ASLEEP] > 0.5).astype(jnp.int32)
+    light = obs[..., LIGHT, None]
+
+    def add(token: Array, cell: tuple[Array, Array]) -> tuple[Array, None]:
+        table, row = cell
+        return token + looked_up(table, Shown(row, light, asleep)), None
+
+    others = np.delete(np.arange(NUM_CELLS), MIDDLE)
+    rows = jnp.moveaxis(codes[..., others], -1, 0)
+    # All tables outside of the loop: they follow from the weights alone, and an episode makes them once.
+    token, _ = jax.lax.scan(add, token, (tables("day", kernels[:, others]), rows))
+    facing = jnp.argmax(obs[..., NUM_CELLS + NUM_COUNTS :][..., :NUM_FACINGS], axis=-1)
+    who = jnp.where(asleep > 0, NUM_FACINGS, facing)
+    row = who * NUM_BLOCKS + codes[..., MIDDLE] % NUM_BLOCKS
+    (table,) = tables("player", kernels[:, MIDDLE : MIDDLE + 1])
+    return token + looked_up(table, Shown(row, light, asleep))
+
+
+def tables(kind: str, kernels: Float[Array, "2 cells TILE E"]) -> Float[Array, "cells 2 2 rows E"]:
+    """The products of the weights of some cells with every tile of a kind that they can show.
+
+    Returns:
+      ``[cells, 2, 2, rows, E]``: awake or asleep, by day or by night.
+    """
+    shown = np.stack([getattr(tiles(), kind), getattr(night_tiles(UNIT), kind)]) / LEVELS
+    flat = jnp.asarray(shown.reshape(2, -1, TILE), jnp.float32)
+    return jnp.einsum("lrt,scte->cslre", flat, kernels)
+
+
+def looked_up(table: Float[Array, "2 2 rows E"], shown: Shown) -> Float[Array, "*batch E"]:
+    """The products of the tiles that are shown at one cell, mixed by the light.
+
+    Args:
+      table: those of the cell (``tables``).
+      shown: which tile each observation shows.
+    """
+    day, night = (table[shown.asleep, index, shown.row] for index in (0, 1))
+    return shown.light * day + (1 - shown.light) * night
+
+
+def _with_items(
+    token: Float[Array, "*batch E"],
+    places: Float[Array, "places TILE E"],
+    obs: Float[Array, "*batch 85"],
+) -> Float[Array, "*batch E"]:
+    """The token plus the icons of the items, which neither night nor sleep changes."""
+    shown = tiles().items.reshape(NUM_COUNTS, -1, TILE) / LEVELS
+    counts = jnp.round(obs[..., NUM_CELLS : NUM_CELLS + NUM_COUNTS]).astype(jnp.int32)
+    for place, name in enumerate(ITEMS):
+        index = COUNTS.index(name)
+        table = jnp.asarray(shown[index], jnp.float32) @ places[place]
+        token = token + table[jnp.clip(counts[..., index], 0, MAX_COUNT)]
+    return token

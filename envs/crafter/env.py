@@ -1,0 +1,185 @@
+"""Crafter: 22 achievements in a world that is generated from a seed (Hafner, 2022).
+
+Paper, appendix C.5, with Craftax-Classic in place of the Python program (``rules.py``). A task is the seed
+of a world; what mobs do is a matter of chance in each episode. An achievement is worth 1 when it is
+unlocked for the first time, and every point of health that is won or lost is worth 0.1. A goal is one
+achievement; the task goal is all of them.
+
+The observation is the codes of all that Crafter draws (``view.py``). The picture that Crafter draws of them
+(``tiles.py``) follows from them, so that a policy which sees the picture is one whose encoder makes it of
+the codes (``encoding.py``); with ``pixels`` the picture itself is the observation.
+
+With places, a goal also says where its achievement was unlocked, and the agent knows where it is itself,
+both relative to the start. The map of a task stays the same in all its episodes, so a prompt of such goals
+says where things are. This is no part of the paper.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from craftax.craftax_classic.envs.craftax_state import EnvState
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
+
+from envs.base import ArraySpec, Discrete, Environment, EnvSpec, TimeStep
+from envs.crafter.rules import SIDE, advance, new_world
+from envs.crafter.tiles import PIXELS, agent_picture
+from envs.crafter.view import (
+    ACHIEVEMENTS,
+    LAYOUT,
+    MAX_COUNT,
+    NUM_ACHIEVEMENTS,
+    NUM_ACTIONS,
+    OBS_SIZE,
+    observe,
+)
+from envs.errors import UsageError
+
+HEALTH_REWARD = 0.1
+PLACE_UNIT = 8.0  # cells
+NUM_PLACE = 3  # numbers of a goal's place: whether it is known, rows and columns from the start
+
+
+class CrafterTask(NamedTuple):
+    """A task: the world that the installed craftax generates from ``seed``, a whole number below 2**32."""
+
+    seed: UInt32[Array, "*batch"]
+
+
+class CrafterState(NamedTuple):
+    """An episode in progress."""
+
+    world: EnvState
+    """Craftax-Classic's state: map ``[64, 64]``, mobs, inventory, achievements ``[22]``, needs."""
+    key: PRNGKeyArray
+    """Of the chance in the steps to come."""
+    steps: Int[Array, ""]
+    health: Int[Array, ""]
+    """After the agent's own last move, before the mobs made theirs."""
+    unlocked: Bool[Array, "22"]
+    """What the last step unlocked; at most one achievement."""
+
+
+@dataclass(frozen=True)
+class Crafter(Environment):
+    """The world of Crafter.
+
+    Attributes:
+      name: what it is called.
+      horizon: number of steps of an episode.
+      pixels: whether an observation is the picture, ``[64, 64, 3]`` bytes, instead of its codes, ``[85]``.
+      places: whether goals have places. A goal is then an achievement, whether its place is known (1) or
+        not (0), and the rows and columns from the start to where the agent stands when it is unlocked, in
+        units of 8 cells; an observation ends with the rows and columns from the start to the agent,
+        likewise.
+    """
+
+    name: str
+    horizon: int
+    pixels: bool = False
+    places: bool = False
+
+    def __post_init__(self) -> None:
+        if self.pixels and self.places:
+            raise UsageError("a picture does not say where the agent is; choose pixels or places")
+
+    @property
+    def spec(self) -> EnvSpec:
+        num_numbers = OBS_SIZE + 2 * self.places
+        return EnvSpec(
+            name=self.name,
+            obs=ArraySpec((PIXELS, PIXELS, 3), "uint8")
+            if self.pixels
+            else ArraySpec((num_numbers,)),
+            goal_dim=NUM_ACHIEVEMENTS + NUM_PLACE * self.places,
+            actions=Discrete(NUM_ACTIONS),
+            horizon=self.horizon,
+            # Nothing is unlocked and all health is lost; or everything is, and none is lost.
+            return_range=(-HEALTH_REWARD * MAX_COUNT, float(NUM_ACHIEVEMENTS)),
+            deterministic=False,
+            # Every achievement is rewarded in any order, which says nothing about the order.
+            reward_confirms_goals=False,
+            layout=None if self.pixels else LAYOUT,
+        )
+
+    @property
+    def goal_names(self) -> tuple[str, ...]:
+        """The achievements."""
+        return ACHIEVEMENTS
+
+    def sample_task(self, key: PRNGKeyArray) -> CrafterTask:
+        return CrafterTask(seed=jax.random.bits(key, (), jnp.uint32))
+
+    def sample_goal(self, key: PRNGKeyArray) -> Float[Array, "G"]:
+        """An achievement, in no known place."""
+        goal = jax.random.randint(key, (), 0, NUM_ACHIEVEMENTS)
+        return self._without_place(jax.nn.one_hot(goal, NUM_ACHIEVEMENTS))
+
+    def task_goal(self, task: CrafterTask) -> Float[Array, "G"]:
+        """All achievements, in every world."""
+        del task
+        return self._without_place(jnp.ones(NUM_ACHIEVEMENTS))
+
+    def _without_place(self, achievements: Float[Array, "22"]) -> Float[Array, "G"]:
+        return jnp.pad(achievements, (0, NUM_PLACE * self.places))
+
+    def check_task(self, tasks: CrafterTask) -> None:
+        seed = np.asarray(tasks.seed)
+        if seed.ndim != 1:
+            raise ValueError(f"seed must have shape [N], found {list(seed.shape)}")
+        super().check_task(tasks)
+        wrong = (seed < 0) | (seed > np.iinfo(np.uint32).max)
+        if wrong.any():
+            index = int(np.argmax(wrong))
+            raise ValueError(
+                f"task {index}: a seed is a whole number from 0 to {np.iinfo(np.uint32).max}, "
+                f"found {seed[index]}"
+            )
+
+    def reset(self, key: PRNGKeyArray, task: CrafterTask) -> tuple[CrafterState, TimeStep]:
+        """The start in the world of the task, without anything and in full health."""
+        world = new_world(task.seed.astype(jnp.uint32))
+        state = CrafterState(
+            world=world,
+            key=key,
+            steps=jnp.zeros((), jnp.int32),
+            health=world.player_health,
+            unlocked=jnp.zeros(NUM_ACHIEVEMENTS, bool),
+        )
+        return state, self._timestep(state, reward=jnp.zeros(()))
+
+    def step(self, state: CrafterState, action: Int[Array, ""]) -> tuple[CrafterState, TimeStep]:
+        key, key_step = jax.random.split(state.key)
+        before = state.world
+        world, health = advance(key_step, before, state.health, action)
+        unlocked = world.achievements & ~before.achievements
+        ended = self._dead(state) | (state.steps >= self.horizon)
+        after = CrafterState(world, key, state.steps + 1, health, unlocked)
+        after = jax.tree.map(lambda old, new: jnp.where(ended, old, new), state, after)
+        gained = world.player_health - before.player_health
+        reward = jnp.sum(unlocked) + HEALTH_REWARD * gained
+        return after, self._timestep(after, jnp.where(ended, 0.0, reward))
+
+    def _dead(self, state: CrafterState) -> Bool[Array, ""]:
+        return state.world.player_health <= 0
+
+    def _timestep(self, state: CrafterState, reward: Float[Array, ""]) -> TimeStep:
+        dead, obs = self._dead(state), observe(state.world)
+        goal, reached = state.unlocked.astype(jnp.float32), jnp.any(state.unlocked)
+        if self.places:
+            place = (state.world.player_position - SIDE // 2) / PLACE_UNIT
+            obs = jnp.concatenate([obs, place])
+            goal = jnp.concatenate([goal, jnp.where(reached, jnp.insert(place, 0, 1.0), 0.0)])
+        return TimeStep(
+            obs=agent_picture(obs) if self.pixels else obs,
+            achieved_goal=goal,
+            goal_reached=reached,
+            outcome=self._without_place(state.world.achievements.astype(jnp.float32)),
+            reward=reward,
+            terminated=dead,
+            truncated=(state.steps >= self.horizon) & ~dead,
+        )

@@ -1,0 +1,47 @@
+"""The package behind Crafter: found and new enough, or a clear error. Nothing here imports jax.
+
+Craftax holds the rules and the textures. Its own renderer keeps a cache of textures in the folder that it
+is installed in; that renderer is not used here, so nothing is ever written there.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from envs.errors import MissingExtraError
+
+INSTALL = 'pip install -e ".[crafter]"'
+OLDEST = (1, 6, 1)
+TEXTURES = Path("craftax_classic/assets")
+
+
+@cache
+def check_extra() -> None:
+    """Raise ``MissingExtraError`` unless Craftax can be loaded; imports nothing of it."""
+    oldest = ".".join(map(str, OLDEST))
+    try:
+        found = version("craftax")
+    except PackageNotFoundError:
+        raise MissingExtraError(f"Crafter needs craftax {oldest} or newer: {INSTALL}") from None
+    numbers = tuple(int(part) for part in found.split(".")[:3] if part.isdigit())
+    if numbers < OLDEST:
+        raise MissingExtraError(
+            f"Crafter needs craftax {oldest} or newer, found {found}: {INSTALL}"
+        )
+    texture_folder()
+
+
+def texture_folder() -> Path:
+    """Where the installed Craftax keeps the textures of Crafter, as PNG files of 16 x 16 pixels.
+
+    Raises:
+      MissingExtraError: if they are not there.
+    """
+    spec = importlib.util.find_spec("craftax")
+    for folder in (spec.submodule_search_locations or ()) if spec else ():
+        if (path := Path(folder) / TEXTURES / "grass.png").is_file():
+            return path.parent
+    raise MissingExtraError(f"craftax has no textures ({TEXTURES}); reinstall it with {INSTALL}")

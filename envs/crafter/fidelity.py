@@ -1,0 +1,186 @@
+"""How close to Crafter and how fast this world is: ``python -m envs.crafter.fidelity``.
+
+It needs the Python package ``crafter``. Printed are what the maps consist of, how many mobs an agent sees
+that wanders about and cannot die, and the steps of a random agent in a CPU-second. That the rules agree is
+the subject of ``tests/test_crafter_official.py``.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from envs.base import Agent
+from envs.crafter.env import Crafter, CrafterState, CrafterTask
+from envs.crafter.rules import new_world
+from envs.crafter.view import BLOCKS, COLUMNS, MAX_COUNT, NUM_ACTIONS, NUM_CELLS, ROWS
+from envs.episodes import run_episode
+from envs.errors import UsageError
+
+BLOCKS_TOLD = ("grass", "water", "stone", "path", "sand", "tree", "coal", "iron", "diamond", "lava")
+MOBS_TOLD = ("zombies", "cows")
+MOVES = range(1, 5)  # left, right, up, down: the same numbers in both programs
+FIRST, DARKEST = slice(0, 100), slice(185, 235)  # steps; the light is least at step 210
+
+
+@dataclass(frozen=True)
+class FidelityConfig:
+    """Settings of this command."""
+
+    worlds: int = 100
+    """Maps whose blocks are counted."""
+    walks: int = 32
+    """Walks of an agent that cannot die."""
+    steps: int = 240
+    """Steps of each of them."""
+    lanes: int = 64
+    """Episodes of a random agent, side by side, whose speed is measured."""
+
+
+def official() -> Any:
+    """The Python package.
+
+    Raises:
+      UsageError: if it is missing.
+    """
+    try:
+        import crafter
+    except ImportError as error:
+        raise UsageError(f"{error}; pip install crafter==1.8.3 opensimplex") from None
+    return crafter
+
+
+def shares_here(num_worlds: int) -> dict[str, float]:
+    """Share of each kind of block in the maps of this world."""
+    seeds = jnp.arange(num_worlds, dtype=jnp.uint32)
+    maps = np.asarray(jax.lax.map(jax.jit(lambda seed: new_world(seed).map), seeds))
+    counts = np.bincount(maps.ravel(), minlength=len(BLOCKS)) / maps.size
+    shares = dict(zip(BLOCKS, counts.tolist(), strict=True))
+    return {name: shares[name] for name in BLOCKS_TOLD}
+
+
+def shares_in_crafter(num_worlds: int) -> dict[str, float]:
+    """The same in the maps of the package."""
+    found: Counter[str] = Counter()
+    for seed in range(num_worlds):
+        env = official().Env(seed=seed)
+        env.reset()
+        names = env._world._mat_names
+        kinds, counts = np.unique(env._world._mat_map, return_counts=True)
+        for kind, count in zip(kinds.tolist(), counts.tolist(), strict=True):
+            found[names[kind]] += count
+    return {name: found[name] / found.total() for name in BLOCKS_TOLD}
+
+
+def seen_here(num_walks: int, num_steps: int) -> Float[np.ndarray, "T mobs"]:
+    """Zombies and cows in view of an agent that cannot die, mean over walks, after each step."""
+    env = Crafter(name="crafter-symbolic", horizon=num_steps + 1)
+
+    def walk(key: PRNGKeyArray, seed: Array) -> Array:
+        key_reset, key_walk = jax.random.split(key)
+        state, _ = env.reset(key_reset, CrafterTask(seed))
+
+        def step(state: CrafterState, key: PRNGKeyArray) -> tuple[CrafterState, Array]:
+            action = jax.random.randint(key, (), MOVES.start, MOVES.stop)
+            state, timestep = env.step(state, action)
+            mobs = timestep.obs[:NUM_CELLS].astype(int) // len(BLOCKS) % 4
+            healthy = state.world.replace(
+                player_health=jnp.full_like(state.world.player_health, MAX_COUNT)
+            )
+            state = state._replace(world=healthy, health=healthy.player_health)
+            return state, jnp.stack([(mobs == 1).sum(), (mobs == 2).sum()])
+
+        return jax.lax.scan(step, state, jax.random.split(key_walk, num_steps))[1]
+
+    keys = jax.random.split(jax.random.key(0), num_walks)
+    seeds = jnp.arange(num_walks, dtype=jnp.uint32)
+    return np.asarray(jax.jit(jax.vmap(walk))(keys, seeds)).mean(axis=0)
+
+
+def seen_in_crafter(num_walks: int, num_steps: int) -> Float[np.ndarray, "T mobs"]:
+    """The same in the package."""
+    objects = official().objects
+    found = np.zeros((num_walks, num_steps, len(MOBS_TOLD)))
+    for seed in range(num_walks):
+        env, rng = official().Env(length=num_steps + 1, seed=seed), np.random.default_rng(seed)
+        env.reset()
+        for time_ in range(num_steps):
+            env.step(int(rng.integers(MOVES.start, MOVES.stop)))
+            env._player.health = MAX_COUNT
+            for index, kind in enumerate((objects.Zombie, objects.Cow)):
+                found[seed, time_, index] = sum(
+                    isinstance(thing, kind) and in_view(thing.pos, env._player.pos)
+                    for thing in env._world.objects
+                )
+    return found.mean(axis=0)
+
+
+def in_view(place: Int[np.ndarray, "2"], agent: Int[np.ndarray, "2"]) -> bool:
+    """Whether a place (column, row) is in view of an agent."""
+    column, row = np.abs(place - agent)
+    return bool(column <= COLUMNS // 2 and row <= ROWS // 2)
+
+
+def random_agent() -> Agent:
+    """Takes any action."""
+
+    def proceed(key: PRNGKeyArray, memory: Any, state: Any, timestep: Any) -> tuple:
+        return jax.random.randint(key, (), 0, NUM_ACTIONS), jnp.zeros((), bool), memory
+
+    return Agent(lambda key, task, state, timestep: proceed(key, (), state, timestep), proceed)
+
+
+def rate(pixels: bool, num_lanes: int) -> float:
+    """Steps of a random agent in a CPU-second, without compilation."""
+    env = Crafter(name="crafter", horizon=500, pixels=pixels)
+    run = jax.jit(
+        jax.vmap(lambda key, task: length_of(run_episode(key, env, random_agent(), task)))
+    )
+    tasks = CrafterTask(jnp.arange(num_lanes, dtype=jnp.uint32))
+    keys = jax.random.split(jax.random.key(0), (2, num_lanes))
+    jax.block_until_ready(run(keys[0], tasks))
+    start = time.process_time()
+    num_steps = int(run(keys[1], tasks).sum())
+    return num_steps / (time.process_time() - start)
+
+
+def length_of(episode: Any) -> Int[Array, ""]:
+    """Its number of steps, which follows from all that it records."""
+    record = episode.trajectory
+    # A sum of the observations, so that none of them is left out of the program.
+    return record.length + (jnp.sum(record.obs.astype(jnp.float32)) < -1.0)
+
+
+def report(config: FidelityConfig) -> Iterator[str]:
+    """Lines of Markdown: what is compared, in Crafter and here."""
+    yield "| | Crafter | here |\n| --- | --- | --- |"
+    shares = shares_in_crafter(config.worlds), shares_here(config.worlds)
+    for name in BLOCKS_TOLD:
+        there, here = (100 * part[name] for part in shares)
+        yield f"| {name}, % of the cells | {there:.1f} | {here:.1f} |"
+    seen = [count(config.walks, config.steps) for count in (seen_in_crafter, seen_here)]
+    for index, name in enumerate(MOBS_TOLD):
+        for part, when in ((FIRST, "first 100 steps"), (DARKEST, "darkest 50")):
+            there, here = (rows[part, index].mean() for rows in seen)
+            yield f"| {name} in view, {when} | {there:.2f} | {here:.2f} |"
+    for pixels, name in ((False, "codes"), (True, "pictures")):
+        yield f"| steps in a CPU-second, {name} | | {rate(pixels, config.lanes):,.0f} |"
+
+
+def main(config: FidelityConfig) -> None:
+    """Print the comparison."""
+    for line in report(config):
+        print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(FidelityConfig))

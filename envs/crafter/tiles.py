@@ -1,0 +1,170 @@
+"""Crafter's picture of an observation, drawn from its codes.
+
+Every cell of the view shows a tile that follows from its code alone, the light and whether the agent
+sleeps; every item shows its icon and its count. So a picture is a few look-ups in tables, which are made
+once from Crafter's textures with the arithmetic of its renderer. Crafter also adds random noise to dark
+pictures. There is none here, so that a picture is exactly its codes.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, UInt8
+from PIL import Image, ImageEnhance
+
+from envs.crafter.extra import texture_folder
+from envs.crafter.view import (
+    ARROWS,
+    ASLEEP,
+    BLOCKS,
+    COLUMNS,
+    COUNTS,
+    LIGHT,
+    MAX_COUNT,
+    MOBS,
+    NUM_BLOCKS,
+    NUM_CELLS,
+    NUM_COUNTS,
+    NUM_FACINGS,
+    ROWS,
+)
+
+PIXELS = 64  # of a side of the picture that agents get, of which the last row and column are black
+UNIT = PIXELS // COLUMNS  # pixels of a side of a cell in it
+ITEM_ROWS = 2  # of icons below the view
+OUTSIDE = 127  # the gray of what is off the map
+NIGHT, SLEEP = np.array([0, 16, 64]), np.array([0, 0, 16])
+GRAY = np.array([19595, 38470, 7471])  # shares of red, green and blue in gray, of 65536
+
+# Crafter's order of the items, and its names of textures where they are not those of blocks.
+ITEMS = (*COUNTS[12:], "sapling", *COUNTS[:5], *COUNTS[6:12])
+TEXTURE = {"invalid": "unknown", "crafting_table": "table", "plant": "grass", "ripe_plant": "grass"}
+ON_BLOCK = {"plant": "plant", "ripe_plant": "plant-ripe"}
+ARROW = {"west": "arrow-left", "east": "arrow-right", "north": "arrow-up", "south": "arrow-down"}
+PLAYER = ("player-left", "player-right", "player-up", "player-down", "player-sleep")
+
+
+class Tiles(NamedTuple):
+    """The tables that pictures are made of, for cells of ``u`` pixels."""
+
+    day: UInt8[np.ndarray, "codes u u 3"]
+    """Of every cell code."""
+    player: UInt8[np.ndarray, "5 blocks u u 3"]
+    """The agent facing west, east, north, south, or asleep, on every block."""
+    items: UInt8[np.ndarray, "16 10 u u 3"]
+    """In the order of the observation's counts, for every count."""
+
+
+@cache
+def tiles(unit: int = UNIT) -> Tiles:
+    """The tables for cells of ``unit`` pixels.
+
+    Raises:
+      MissingExtraError: if the textures are missing.
+    """
+    blocks = [_block(name, unit) for name in BLOCKS]
+    day = []
+    for arrow in ARROWS:
+        for mob in MOBS:
+            for block in blocks:
+                tile = block if mob == "none" else _over(block, _texture(mob, unit))
+                shown = tile if arrow == "none" else _over(tile, _texture(ARROW[arrow], unit))
+                day.append(shown)
+    player = [[_over(block, _texture(name, unit)) for block in blocks] for name in PLAYER]
+    items = [[_item(name, count, unit) for count in range(MAX_COUNT + 1)] for name in COUNTS]
+    return Tiles(np.stack(day), np.array(player), np.array(items))
+
+
+def picture(obs: Float[Array, "O"], unit: int = UNIT) -> UInt8[Array, "height width 3"]:
+    """What Crafter draws at an observation: the view, and below it the items, ``[9 u, 9 u, 3]`` bytes."""
+    table, dark = tiles(unit), night_tiles(unit)
+    codes = obs[:NUM_CELLS].astype(jnp.int32)
+    facing = jnp.argmax(obs[NUM_CELLS + NUM_COUNTS :][:NUM_FACINGS])
+    asleep = obs[ASLEEP] > 0.5
+    who, middle = jnp.where(asleep, NUM_FACINGS, facing), NUM_CELLS // 2
+    block = codes[middle] % NUM_BLOCKS
+
+    def view(cells: np.ndarray, agent: np.ndarray) -> Float[Array, "63 u u 3"]:
+        shown = jnp.asarray(cells)[codes].astype(jnp.float32)
+        return shown.at[middle].set(jnp.asarray(agent)[who, block].astype(jnp.float32))
+
+    light = obs[LIGHT]
+    lit = light * view(table.day, table.player) + (1 - light) * view(dark.day, dark.player)
+    lit = jnp.floor(lit).astype(jnp.int32)
+    gray = (jnp.sum(lit * GRAY, axis=-1, keepdims=True) + 0x8000) >> 16
+    lit = jnp.where(asleep, (gray + SLEEP) // 2, lit).astype(jnp.uint8)
+    local = lit.reshape(ROWS, COLUMNS, unit, unit, 3).swapaxes(1, 2)
+
+    counts = obs[NUM_CELLS : NUM_CELLS + NUM_COUNTS].astype(jnp.int32)
+    icons = jnp.asarray(table.items)[jnp.arange(NUM_COUNTS), counts][_item_order()]
+    empty = jnp.zeros((ITEM_ROWS * COLUMNS - NUM_COUNTS, unit, unit, 3), jnp.uint8)
+    below = jnp.concatenate([icons, empty]).reshape(ITEM_ROWS, COLUMNS, unit, unit, 3)
+    whole = jnp.concatenate([local, below.swapaxes(1, 2)])
+    return whole.reshape((ROWS + ITEM_ROWS) * unit, COLUMNS * unit, 3)
+
+
+def agent_picture(obs: Float[Array, "O"]) -> UInt8[Array, "64 64 3"]:
+    """The picture of 64 x 64 pixels that Crafter gives to agents; its last row and column are black."""
+    return jnp.pad(picture(obs), ((0, PIXELS % COLUMNS), (0, PIXELS % COLUMNS), (0, 0)))
+
+
+class NightTiles(NamedTuple):
+    """``Tiles`` in the dark, before Crafter rounds to bytes."""
+
+    day: Float[np.ndarray, "codes u u 3"]
+    player: Float[np.ndarray, "5 blocks u u 3"]
+
+
+@cache
+def night_tiles(unit: int) -> NightTiles:
+    """The tiles without most of their color and with a tint of blue."""
+
+    def darkened(some: UInt8[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        flat = some.reshape(-1, unit, 3)
+        pale = np.asarray(ImageEnhance.Color(Image.fromarray(flat)).enhance(0.4))
+        return (0.5 * pale + 0.5 * NIGHT).reshape(some.shape).astype(np.float32)
+
+    return NightTiles(*map(darkened, tiles(unit)[:2]))
+
+
+def _item_order() -> Int[np.ndarray, "16"]:
+    """The place of each of Crafter's items among the counts of an observation."""
+    return np.array([COUNTS.index(name) for name in ITEMS])
+
+
+@cache
+def _texture(name: str, size: int) -> UInt8[np.ndarray, "size size channels"]:
+    """A texture of Crafter with its channels, of which the fourth is its opacity if it has one."""
+    with Image.open(texture_folder() / f"{name}.png") as image:
+        return np.asarray(image.resize((size, size), resample=Image.Resampling.NEAREST))
+
+
+def _block(name: str, unit: int) -> UInt8[np.ndarray, "u u 3"]:
+    if name == "out_of_bounds":
+        return np.full((unit, unit, 3), OUTSIDE, np.uint8)
+    tile = _texture(TEXTURE.get(name, name), unit)[..., :3]
+    return _over(tile, _texture(ON_BLOCK[name], unit)) if name in ON_BLOCK else tile
+
+
+def _item(name: str, count: int, unit: int) -> UInt8[np.ndarray, "u u 3"]:
+    """An icon and its count, on black; nothing for nothing."""
+    tile = np.zeros((unit, unit, 3), np.uint8)
+    if count:
+        for what, share, offset in ((name, 0.8, 0.1), (str(count), 0.6, 0.4)):
+            texture, start = _texture(what, int(share * unit)), int(offset * unit)
+            place = slice(start, start + len(texture))
+            tile[place, place] = _over(tile[place, place], texture)
+    return tile
+
+
+def _over(below: UInt8[np.ndarray, "h w 3"], texture: np.ndarray) -> UInt8[np.ndarray, "h w 3"]:
+    """A texture on something, in Crafter's arithmetic."""
+    if texture.shape[-1] < 4:
+        return texture
+    share = texture[..., 3:].astype(np.float32) / 255
+    above, under = (part[..., :3].astype(np.float32) / 255 for part in (texture, below))
+    return (255 * (share * above + (1 - share) * under)).astype(np.uint8)
