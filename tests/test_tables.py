@@ -118,7 +118,7 @@ def test_the_published_table_is_that_of_the_results(
 ) -> None:
     monkeypatch.chdir(ROOT)
     worlds = ("maze15", "maze30", "gridworld", "kitchen", "kitchen-stock", "kitchen-mjx")
-    methods = ("ucb", "bpe", "explore", "grips", "bbt")
+    methods = ("ucb", "bpe", "explore", "grips", "bbt", "ucb-seed1", "ucb-seed2")
     folders = [Path("results", world, method) for world in worlds for method in methods]
     main(TableConfig(runs=tuple(folder for folder in folders if folder.exists())))
     assert capsys.readouterr().out == Path("results/table.md").read_text()
