@@ -136,7 +136,7 @@ def tables(kind: str, kernels: Float[Array, "2 cells TILE E"]) -> Float[Array, "
     Returns:
       ``[cells, 2, 2, rows, E]``: awake or asleep, by day or by night.
     """
-    shown = np.stack([getattr(tiles(), kind), getattr(night_tiles(UNIT), kind)]) / LEVELS
+    shown = np.stack([getattr(tiles(UNIT), kind), getattr(night_tiles(UNIT), kind)]) / LEVELS
     flat = jnp.asarray(shown.reshape(2, -1, TILE), jnp.float32)
     return jnp.einsum("lrt,scte->cslre", flat, kernels)
 
@@ -158,7 +158,7 @@ def _with_items(
     obs: Float[Array, "*batch 85"],
 ) -> Float[Array, "*batch E"]:
     """The token plus the icons of the items, which neither night nor sleep changes."""
-    shown = tiles().items.reshape(NUM_COUNTS, -1, TILE) / LEVELS
+    shown = tiles(UNIT).items.reshape(NUM_COUNTS, -1, TILE) / LEVELS
     counts = jnp.round(obs[..., NUM_CELLS : NUM_CELLS + NUM_COUNTS]).astype(jnp.int32)
     for place, name in enumerate(ITEMS):
         index = COUNTS.index(name)

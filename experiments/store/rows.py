@@ -184,18 +184,26 @@ HEAD = (
 )  # fmt: skip
 
 
-FURTHER: Mapping[str, Callable[[Summary], str]] = {
-    "best single episode": lambda summary: f"{summary['best_episode_return']:.2f}",
-    "fresh": lambda summary: (
-        f"{summary['final_return']:.2f} ({summary['fresh']['episodes']} sampled)"
+FURTHER: Mapping[str, tuple[str, Callable[[Summary], str]]] = {
+    "best single episode": ("fresh", lambda summary: f"{summary['best_episode_return']:.2f}"),
+    "fresh": (
+        "fresh",
+        lambda summary: f"{summary['final_return']:.2f} ({summary['fresh']['episodes']} sampled)",
     ),
-    "fresh - initial [95 % over tasks]": lambda summary: str(
-        Interval(summary["fresh"]["gain"], *(summary["fresh"]["gain_95"] or ()))
+    "fresh - initial [95 % over tasks]": (
+        "fresh",
+        lambda summary: str(
+            Interval(summary["fresh"]["gain"], *(summary["fresh"]["gain_95"] or ()))
+        ),
     ),
-    "score": lambda summary: f"{mean_log_success(_achieved(summary)):.2f}",
-    "goals achieved": lambda summary: f"{100 * np.mean(_achieved(summary)):.1f} %",
+    "score": ("achieved", lambda summary: f"{mean_log_success(_achieved(summary)):.2f}"),
+    "goals achieved": (
+        "achieved",
+        lambda summary: f"{100 * np.mean(_achieved(summary)):.1f} %",
+    ),
 }
-"""Columns that only some worlds fill, by what stands above them."""
+"""Columns that only some worlds fill, by what stands above them: the entry of a summary that a cell needs,
+and the cell."""
 
 
 def _achieved(summary: Summary) -> list[float]:
@@ -205,8 +213,8 @@ def _achieved(summary: Summary) -> list[float]:
 
 def _further(name: str, summary: Summary) -> str:
     """A cell of ``FURTHER``; empty where a summary has nothing to say."""
-    needed = "achieved" if name in ("score", "goals achieved") else "fresh"
-    return FURTHER[name](summary) if needed in summary else ""
+    needed, cell = FURTHER[name]
+    return cell(summary) if needed in summary else ""
 
 
 def comparison(rows: Sequence[Row]) -> str:
