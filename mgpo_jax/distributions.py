@@ -1,17 +1,19 @@
 """Action distributions: what a policy returns and training scores, behind one interface.
 
 A policy head puts out ``head.num_params(action_dim)`` numbers; ``head.make(params)`` turns them into
-a distribution with ``log_prob``, ``sample``, ``mode``, ``explore`` and ``tempered``.
+a distribution with ``log_prob``, ``sample``, ``mode``, ``explore``, ``tempered`` and ``kl``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from envs.errors import NotAvailableError
 
 
 @runtime_checkable
@@ -31,6 +33,14 @@ class Distribution(Protocol):
 
     def tempered(self, temperature: Float[Array, ""]) -> Distribution:
         """The distribution whose density is this one's to the power of 1 / temperature, normalized."""
+        ...
+
+    def kl(self, other: Any) -> Float[Array, "*batch"]:
+        """KL(self, other) for another distribution of the same kind, in nats.
+
+        Raises:
+          NotAvailableError: where there is no closed form.
+        """
         ...
 
 
@@ -55,6 +65,10 @@ class Categorical(NamedTuple):
 
     def tempered(self, temperature: Float[Array, ""]) -> Categorical:
         return Categorical(self.logits / temperature)
+
+    def kl(self, other: Categorical) -> Float[Array, "*batch"]:
+        log_p, log_q = jax.nn.log_softmax(self.logits), jax.nn.log_softmax(other.logits)
+        return jnp.sum(jnp.exp(log_p) * (log_p - log_q), axis=-1)
 
 
 class Gaussian(NamedTuple):
@@ -82,6 +96,12 @@ class Gaussian(NamedTuple):
 
     def tempered(self, temperature: Float[Array, ""]) -> Gaussian:
         return Gaussian(self.mean, self.log_std + 0.5 * jnp.log(temperature))
+
+    def kl(self, other: Gaussian) -> Float[Array, "*batch"]:
+        """The divergence before actions are clipped."""
+        ratio = jnp.exp(self.log_std - other.log_std)
+        shift = (self.mean - other.mean) * jnp.exp(-other.log_std)
+        return jnp.sum((ratio**2 + shift**2 - 1) / 2 - jnp.log(ratio), axis=-1)
 
 
 class Mixture(NamedTuple):
@@ -117,6 +137,9 @@ class Mixture(NamedTuple):
         # The integral of a component's density to the power of 1 / temperature.
         volume = (1 - 1 / temperature) * self.log_std.sum(axis=-1)
         return Mixture(self.logits / temperature + volume, self.mean, log_std)
+
+    def kl(self, other: Mixture) -> Float[Array, "*batch"]:
+        raise NotAvailableError("the divergence of two mixtures has no closed form")
 
     def _component(self, which: Int[Array, "*batch"]) -> Gaussian:
         index = which[..., None, None]
@@ -160,6 +183,9 @@ class Binned(NamedTuple):
 
     def tempered(self, temperature: Float[Array, ""]) -> Binned:
         return Binned(self.logits / temperature)
+
+    def kl(self, other: Binned) -> Float[Array, "*batch"]:
+        return jnp.sum(Categorical(self.logits).kl(Categorical(other.logits)), axis=-1)
 
 
 class Head(NamedTuple):

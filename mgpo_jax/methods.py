@@ -221,8 +221,14 @@ METHODS: Registry[Method] = Registry(
     Method,
     "mgpo_jax.methods",
     {
-        name: f"mgpo_jax.methods:{name.upper()}"
-        for name in ("ucb", "bpe", "explore", "grips", "bbt", "gcbc")
+        **{
+            name: f"mgpo_jax.methods:{name.upper()}"
+            for name in ("ucb", "bpe", "explore", "grips", "bbt", "gcbc")
+        },
+        **{
+            name: f"mgpo_jax.baselines.methods:{name.upper().replace('-', '_')}"
+            for name in ("reinforce", "reinforce-careful", "ppo", "ppo-careful")
+        },
     },
 )
 

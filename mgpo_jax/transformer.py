@@ -242,6 +242,16 @@ class GoalTransformer(nn.Module):
 
         With ``deterministic=False`` dropout is on and an rng named ``dropout`` is needed.
         """
+        return self.read_out(self.features(prompt, obs, actions, deterministic))
+
+    def features(
+        self,
+        prompt: Prompt,
+        obs: Shaped[Array, "T ..."],
+        actions: Array,
+        deterministic: bool = True,
+    ) -> Float[Array, "T E"]:
+        """What the last layer reads at all T observations."""
         num_steps = obs.shape[0]
         num_slots = self.config.max_prompt_length
         steps = self._step_tokens(obs, actions, self.embed_time[:num_steps])
@@ -271,7 +281,7 @@ class GoalTransformer(nn.Module):
                 return jnp.concatenate(mixed)
 
             x = block(x, rows, attend, deterministic)
-        return self._read_out(x)
+        return self.norm_out(x)
 
     def prefill(self, prompt: Prompt, obs: Shaped[Array, "..."]) -> tuple[Distribution, KVCache]:
         """Read the prompt and the first observation; returns pi(a_1) and the cache."""
@@ -329,7 +339,7 @@ class GoalTransformer(nn.Module):
 
             x = block(x, slice(first_row, None), attend, True)
         grown = KVCache(tuple(keys), tuple(values), cache.prompt_mask, cache.step + 1)
-        return jax.tree.map(lambda leaf: leaf[-1], self._read_out(x)), grown
+        return jax.tree.map(lambda leaf: leaf[-1], self.read_out(self.norm_out(x))), grown
 
     def _prompt_tokens(self, prompt: Prompt) -> Float[Array, "P E"]:
         tokens = self.embed_goal(prompt.goals)
@@ -363,5 +373,6 @@ class GoalTransformer(nn.Module):
         pairs = jnp.stack([self._obs_token(obs, time), self._action_token(actions, time)], axis=1)
         return pairs.reshape(2 * len(obs), -1)[:-1]  # nothing follows the last action
 
-    def _read_out(self, x: Float[Array, "R E"]) -> Distribution:
-        return HEADS[self.config.head].make(self.head(self.norm_out(x)))
+    def read_out(self, x: Float[Array, "*R E"]) -> Distribution:
+        """Action distributions from ``features``."""
+        return HEADS[self.config.head].make(self.head(x))

@@ -118,7 +118,8 @@ OTHERS = [name for name in methods.names() if name not in ("ucb", "grips")]
 
 @pytest.mark.parametrize("method", OTHERS)
 def test_methods_adapt(command: Run, policy: Path, method: str) -> None:
-    done = command(adapt(method))
+    rounds = " --round-episodes 3" if hasattr(methods.find(method).hyper, "round_episodes") else ""
+    done = command(adapt(method) + rounds)
     assert done.code == 0, done.err
     assert f"own_world:WORLD, {method}: 4 tasks x 2 seeds x 6 episodes" in done.out
     check_without_optimum(Path(method), done.out)

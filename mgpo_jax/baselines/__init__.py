@@ -1,0 +1,1 @@
+"""What the paper compares prompt optimization with, as adapters (Tables 1 and 8)."""

@@ -1,0 +1,298 @@
+"""BC-finetune: the pre-trained network learns from the returns of the prompt (g^M) (paper, Tables 1, 7, 8).
+
+The prompt stays (g^M). A round plays some episodes with sampled actions and one set of weights, and then
+updates the weights by REINFORCE or PPO. Table 7 gives the discount, the learning rate, its "decay" and the
+episodes of a round; everything else is ours, and no code of the authors shows it. Actions are sampled from
+the pre-trained head's own distribution, where the authors sample the kitchen's with a fixed spread.
+
+Everything is for one task, as in every adapter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
+
+from envs.base import Agent, Episode
+from envs.errors import UsageError
+from mgpo_jax.adaptation import Adapter
+from mgpo_jax.baselines.methods import FinetuneHyper, PpoHyper, ReinforceHyper
+from mgpo_jax.baselines.returns import advantages, returns_to_go
+from mgpo_jax.baselines.subsets import Subset, subset
+from mgpo_jax.distributions import Distribution
+from mgpo_jax.methods import Setting
+from mgpo_jax.optimizers.methods import judged_query
+from mgpo_jax.policy import transformer_policy
+from mgpo_jax.prompts import Prompt, single_goal
+from mgpo_jax.rollout import Query, prompted
+from mgpo_jax.transformer import GoalTransformer
+from mgpo_jax.trees import choose
+
+
+class ValueHead(NamedTuple):
+    """A linear map from the network's features to the value of an observation."""
+
+    weights: Float[Array, "*batch E"]
+    bias: Float[Array, "*batch"]
+
+    def __call__(self, features: Float[Array, "*T E"]) -> Float[Array, "*T"]:
+        return features @ self.weights + self.bias
+
+
+class Weights(NamedTuple):
+    """What an update trains."""
+
+    policy: Any
+    """The part of the network that is trained; see ``subsets``."""
+    value: ValueHead
+
+
+class Learner(NamedTuple):
+    """State of the finetuning on one task."""
+
+    task_goal: Float[Array, "*batch G"]
+    weights: Weights
+    opt_state: Any
+    rounds: Int[Array, "*batch"]
+    """Rounds played so far."""
+
+
+class Batch(NamedTuple):
+    """The K episodes of a round, with what stays fixed while they are learned from."""
+
+    prompt: Prompt
+    obs: Shaped[Array, "K T ..."]
+    actions: Array
+    rewards: Float[Array, "K T"]
+    real: Bool[Array, "K T"]
+    before: Distribution
+    """The action distributions that the episodes were played with, [K, T]."""
+    pretrained: Distribution
+    """Those of the pre-trained network at the same observations."""
+    values: Float[Array, "K T"]
+    """Values before the update."""
+
+
+class Pass(NamedTuple):
+    """What the network says of the episodes of a round."""
+
+    actions: Distribution
+    values: Float[Array, "K T"]
+
+
+Loss = Callable[[Pass, Batch], Float[Array, ""]]
+
+
+class Round(NamedTuple):
+    """How an algorithm learns from a round."""
+
+    loss: Callable[[Batch], Loss]
+    """``(batch) -> ((pass, batch) -> loss)``: what it computes once before the first gradient step."""
+    epochs: int = 1
+    share_trunk: bool = False
+    """Whether the error of the values trains the network below the value head."""
+    value_rounds: Int[Array, ""] | int = 0
+    """Rounds at the start in which the policy stays as it is."""
+    value_rate: Float[Array, ""] | float = 0.0
+    max_kl: Float[Array, ""] | float | None = None
+
+
+def real_mean(values: Float[Array, "K T"], real: Bool[Array, "K T"]) -> Float[Array, ""]:
+    """Mean over the real steps."""
+    return jnp.sum(jnp.where(real, values, 0.0)) / jnp.maximum(real.sum(), 1)
+
+
+def optimizer(hyper: FinetuneHyper, value_rate: Any) -> optax.GradientTransformation:
+    """AdamW with clipped gradients, for the policy and the value head apart."""
+
+    def adamw(rate: Any) -> optax.GradientTransformation:
+        def schedule(count: Array) -> Array:
+            return rate * jnp.minimum((count + 1) / jnp.maximum(hyper.warmup_rounds, 1), 1.0)
+
+        return optax.chain(
+            optax.clip_by_global_norm(hyper.clip_norm),
+            optax.adamw(schedule, weight_decay=hyper.weight_decay),
+        )
+
+    kinds = {"policy": adamw(hyper.learning_rate), "value": adamw(value_rate)}
+    return optax.multi_transform(kinds, Weights._make(["policy", "value"]))
+
+
+class Finetuner:
+    """A policy gradient on one task; all methods are pure.
+
+    Args:
+      setting: what is known beforehand.
+      params: the pre-trained weights.
+      hyper: what both algorithms share.
+      how: the algorithm.
+    """
+
+    def __init__(self, setting: Setting, params: Any, hyper: FinetuneHyper, how: Round) -> None:
+        self.setting, self.params, self.hyper, self.how = setting, params, hyper, how
+        self.network = GoalTransformer(setting.network)
+        self.part: Subset = subset(hyper.tune, params, hyper.rank)
+        self.optimize = optimizer(hyper, how.value_rate)
+
+    def adapter(self) -> Adapter:
+        """The same as an adapter."""
+        return Adapter(
+            init=self.init,
+            ask=self.ask,
+            agent=self.agent,
+            tell=self.tell,
+            best=lambda state: judged_query(self.prompt_of(state), self.setting.judged),
+            episodes_per_round=self.hyper.round_episodes,
+            tell_in_turn=True,
+        )
+
+    def init(self, key: PRNGKeyArray, task_goal: Float[Array, "G"]) -> Learner:
+        value = ValueHead(jnp.zeros(self.setting.network.embed_dim), jnp.zeros(()))
+        weights = Weights(self.part.start(key), value)
+        return Learner(task_goal, weights, self.optimize.init(weights), jnp.zeros((), jnp.int32))
+
+    def prompt_of(self, state: Learner) -> Prompt:
+        """The prompt (g^M), which stays."""
+        return single_goal(state.task_goal, self.setting.network.max_prompt_length)
+
+    def ask(self, key: PRNGKeyArray, state: Learner) -> tuple[Query, Learner]:
+        del key
+        temperature = jnp.ones(()) if self.setting.judged.tempered else None
+        return Query(self.prompt_of(state), jnp.zeros((), bool), temperature), state
+
+    def agent(self, state: Learner, query: Query) -> Agent:
+        params = self.part.merge(state.weights.policy)
+        return prompted(transformer_policy(self.setting.network, params), query)
+
+    def tell(self, key: PRNGKeyArray, state: Learner, query: Query, episodes: Episode) -> Learner:
+        """Learn from a round."""
+        del key
+        batch = self._batch(state, query, episodes)
+        loss_of = self.how.loss(batch)
+
+        def loss(weights: Weights) -> tuple[Array, Array]:
+            now = self._passed(weights, batch)
+            away = real_mean(now.actions.kl(batch.pretrained), batch.real)
+            moved = real_mean(batch.before.kl(now.actions), batch.real)
+            return loss_of(now, batch) + self.hyper.kl * away, moved
+
+        def epoch(index: Array, carry: tuple) -> tuple:
+            del index
+            weights, opt_state, going = carry
+            grads, moved = jax.grad(loss, has_aux=True)(weights)
+            if self.how.max_kl is not None:
+                going = going & (moved <= self.how.max_kl)
+            updates, new_state = self.optimize.update(grads, opt_state, weights)
+            new = optax.apply_updates(weights, updates)
+            learns = state.rounds >= self.how.value_rounds
+            new = new._replace(policy=choose(learns, new.policy, weights.policy))
+            new, new_state = choose(going, (new, new_state), (weights, opt_state))
+            return new, new_state, going
+
+        start = (state.weights, state.opt_state, jnp.ones((), bool))
+        weights, opt_state, _ = jax.lax.fori_loop(0, self.how.epochs, epoch, start)
+        return state._replace(weights=weights, opt_state=opt_state, rounds=state.rounds + 1)
+
+    def _batch(self, state: Learner, query: Query, episodes: Episode) -> Batch:
+        trajectory = episodes.trajectory
+        obs, actions = trajectory.obs, trajectory.actions
+        merged = self.part.merge(state.weights.policy)
+        before, features = self._look(merged, query.prompt, obs, actions)
+        return Batch(
+            prompt=query.prompt,
+            obs=obs,
+            actions=actions,
+            rewards=episodes.rewards,
+            real=jnp.arange(actions.shape[1]) < trajectory.length[:, None],
+            before=before,
+            pretrained=self._look(self.params, query.prompt, obs, actions)[0],
+            values=state.weights.value(features),
+        )
+
+    def _look(
+        self, params: Any, prompt: Prompt, obs: Array, actions: Array
+    ) -> tuple[Distribution, Array]:
+        """Action distributions and features at all steps of K episodes."""
+
+        def one(obs: Array, actions: Array) -> Any:
+            features = self.network.apply(params, prompt, obs, actions, method="features")
+            return self.network.apply(params, features, method="read_out"), features
+
+        seen: tuple[Distribution, Array] = jax.vmap(one)(obs, actions)
+        return seen
+
+    def _passed(self, weights: Weights, batch: Batch) -> Pass:
+        merged = self.part.merge(weights.policy)
+        actions, features = self._look(merged, batch.prompt, batch.obs, batch.actions)
+        if not self.how.share_trunk:
+            features = jax.lax.stop_gradient(features)
+        return Pass(actions, weights.value(features))
+
+
+def make_reinforce(setting: Setting, params: Any, hyper: ReinforceHyper) -> Adapter:
+    """REINFORCE: -mean_t (G_t - b_t) log pi(a_t | g^M, h_t, o_t), with b_t = 0 unless asked for."""
+
+    def loss_of(batch: Batch) -> Loss:
+        togo = jax.vmap(returns_to_go, (0, None))(batch.rewards, hyper.discount)
+        if hyper.baseline:
+            togo = togo - togo.mean(axis=0)
+
+        def loss(now: Pass, batch: Batch) -> Array:
+            return -real_mean(togo * now.actions.log_prob(batch.actions), batch.real)
+
+        return loss
+
+    return Finetuner(setting, params, hyper, Round(loss_of)).adapter()
+
+
+def make_ppo(setting: Setting, params: Any, hyper: PpoHyper) -> Adapter:
+    """PPO with clipped ratios (Schulman et al., 2017) and generalized advantage estimation.
+
+    Advantages are normalized over the real steps of a round, whose episodes are one batch.
+    """
+
+    def loss_of(batch: Batch) -> Loss:
+        estimate = jax.vmap(advantages, (0, 0, 0, None, None))
+        gains = estimate(batch.rewards, batch.values, batch.real, hyper.discount, hyper.gae_lambda)
+        targets = jax.lax.stop_gradient(gains + batch.values)
+        mean = real_mean(gains, batch.real)
+        spread = jnp.sqrt(real_mean((gains - mean) ** 2, batch.real))
+        gains = jax.lax.stop_gradient((gains - mean) / (spread + 1e-8))
+        old = jax.lax.stop_gradient(batch.before.log_prob(batch.actions))
+
+        def loss(now: Pass, batch: Batch) -> Array:
+            log_ratio = now.actions.log_prob(batch.actions) - old
+            ratio = jnp.exp(jnp.where(batch.real, log_ratio, 0.0))
+            clipped = jnp.clip(ratio, 1 - hyper.clip, 1 + hyper.clip)
+            gained = jnp.minimum(ratio * gains, clipped * gains)
+            missed = (now.values - targets) ** 2
+            return -real_mean(gained, batch.real) + hyper.value_weight * real_mean(
+                missed, batch.real
+            )
+
+        return loss
+
+    how = Round(
+        loss_of,
+        epochs=hyper.epochs,
+        share_trunk=hyper.share_trunk,
+        value_rounds=hyper.value_rounds,
+        value_rate=hyper.value_rate,
+        max_kl=hyper.max_kl,
+    )
+    return Finetuner(setting, params, hyper, how).adapter()
+
+
+def check_finetune(setting: Setting, hyper: FinetuneHyper) -> None:
+    """Raise ``UsageError`` for a policy whose exploring actions are no samples of its distribution."""
+    del hyper
+    if setting.network.head == "mixture":
+        raise UsageError(
+            "a policy gradient needs actions that are samples of the policy, and a mixture explores "
+            "without the noise of its components; pre-train with --head binned or --head gaussian"
+        )

@@ -1,0 +1,350 @@
+"""BC-finetune: returns, divergences, one update against oracles, and small worlds that it learns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from envs.base import ArraySpec, Discrete, Environment, EnvSpec, Episode, TimeStep
+from envs.episodes import run_episode
+from envs.errors import NotAvailableError, UsageError
+from envs.registry import Judgement
+from mgpo_jax import methods
+from mgpo_jax.adaptation import Adapter, search
+from mgpo_jax.baselines.finetune import make_ppo, make_reinforce
+from mgpo_jax.baselines.methods import (
+    CarefulPpoHyper,
+    CarefulReinforceHyper,
+    PpoHyper,
+    ReinforceHyper,
+)
+from mgpo_jax.baselines.returns import advantages, returns_to_go
+from mgpo_jax.baselines.subsets import subset
+from mgpo_jax.distributions import HEADS
+from mgpo_jax.methods import Setting
+from mgpo_jax.optimizers.base import PromptOptimizer
+from mgpo_jax.optimizers.methods import fixed_prompt, prompt_adapter
+from mgpo_jax.policy import transformer_policy
+from mgpo_jax.prompts import single_goal
+from mgpo_jax.rollout import Query
+from mgpo_jax.transformer import GoalTransformer, network_config
+
+NUM_STATES = 5
+
+
+class ChainState(NamedTuple):
+    place: jax.Array
+    steps: jax.Array
+
+
+@dataclass(frozen=True)
+class Chain(Environment):
+    """States 0 to 4 in a row; action 1 goes right and 0 left, and state 4 pays 1 and ends the episode."""
+
+    horizon: int = 8
+
+    @property
+    def spec(self) -> EnvSpec:
+        return EnvSpec(
+            name="chain",
+            obs=ArraySpec((NUM_STATES,)),
+            goal_dim=1,
+            actions=Discrete(2),
+            horizon=self.horizon,
+            return_range=(0.0, 1.0),
+        )
+
+    def sample_task(self, key):
+        return jnp.zeros((), jnp.int32)
+
+    def task_goal(self, task):
+        return jnp.ones(1)
+
+    def reset(self, key, task):
+        state = ChainState(jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
+        return state, self._seen(state, jnp.zeros((), bool))
+
+    def step(self, state, action):
+        over = (state.place == NUM_STATES - 1) | (state.steps >= self.horizon)
+        place = jnp.clip(state.place + jnp.where(action == 1, 1, -1), 0, NUM_STATES - 1)
+        state = ChainState(jnp.where(over, state.place, place), state.steps + ~over)
+        return state, self._seen(state, ~over & (state.place == NUM_STATES - 1))
+
+    def _seen(self, state, paid):
+        there = state.place == NUM_STATES - 1
+        return TimeStep(
+            obs=jax.nn.one_hot(state.place, NUM_STATES),
+            achieved_goal=jnp.ones(1) * there,
+            goal_reached=there,
+            outcome=jnp.ones(1) * there,
+            reward=jnp.float32(paid),
+            terminated=there,
+            truncated=~there & (state.steps >= self.horizon),
+        )
+
+
+ENV = Chain()
+NETWORK = network_config(
+    ENV.spec, max_prompt_length=2, embed_dim=16, num_layers=1, num_heads=1, dropout=0.0
+)
+SETTING = Setting(ENV, NETWORK, 20, Judgement())
+TASK = jnp.zeros((), jnp.int32)
+GOAL = jnp.ones(1)
+
+
+@pytest.fixture(scope="module")
+def params() -> Any:
+    inputs = (single_goal(GOAL, 2), jnp.zeros((2, NUM_STATES)), jnp.zeros(2, jnp.int32))
+    return GoalTransformer(NETWORK).init(jax.random.key(0), *inputs)
+
+
+@pytest.fixture(scope="module")
+def round_of_episodes(params: Any) -> tuple[Adapter, Any, Query, Episode]:
+    """An adapter of PPO with the state, choice and episodes of its first round."""
+    adapter = make_ppo(SETTING, params, PpoHyper())
+    state = adapter.init(jax.random.key(1), GOAL)
+    query, state = adapter.ask(jax.random.key(2), state)
+    play = jax.jit(jax.vmap(lambda key: run_episode(key, ENV, adapter.agent(state, query), TASK)))
+    rounds = (play(jax.random.split(jax.random.key(seed), 5)) for seed in range(100))
+    lengths = lambda episodes: set(episodes.trajectory.length.tolist())  # noqa: E731
+    episodes = next(episodes for episodes in rounds if len(lengths(episodes)) > 2)
+    return adapter, state, query, episodes
+
+
+def assert_close(first: Any, second: Any, atol: float) -> None:
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=atol, rtol=0), first, second)
+
+
+def assert_equal(first: Any, second: Any) -> None:
+    jax.tree.map(np.testing.assert_array_equal, first, second)
+
+
+def test_returns_and_advantages_by_hand() -> None:
+    rewards = jnp.array([1.0, 0.0, 2.0, 0.0])
+    values = jnp.array([0.5, 1.0, 1.5, 9.0])
+    real = jnp.array([True, True, True, False])
+    assert_close(returns_to_go(rewards, 0.5), jnp.array([1.5, 1.0, 2.0, 0.0]), 1e-6)
+    one = advantages(rewards, values, real, 0.5, 1.0)
+    assert_close(one, jnp.array([1.0, 0.0, 0.5, 0.0]), 1e-6)  # return-to-go minus value
+    none = advantages(rewards, values, real, 0.5, 0.0)
+    assert_close(none, jnp.array([1.0, -0.25, 0.5, 0.0]), 1e-6)  # errors of one step
+
+
+def test_advantages_equal_the_sum_of_the_definition() -> None:
+    rng = np.random.default_rng(0)
+    rewards, values = (rng.normal(size=20).astype(np.float32) for _ in range(2))
+    length, discount, lam = 13, 0.9, 0.8
+    rewards[length:] = 0
+    errors = [
+        rewards[t] + (discount * values[t + 1] if t + 1 < length else 0) - values[t]
+        for t in range(length)
+    ]
+    wanted = [
+        sum((discount * lam) ** (u - t) * errors[u] for u in range(t, length))
+        for t in range(length)
+    ]
+    found = advantages(
+        jnp.array(rewards), jnp.array(values), jnp.arange(20) < length, discount, lam
+    )
+    np.testing.assert_allclose(found[:length], wanted, atol=1e-5)
+    assert not found[length:].any()
+
+
+@pytest.mark.parametrize("head", ["categorical", "binned", "gaussian"])
+def test_divergences_are_those_of_samples(head: str) -> None:
+    num = HEADS[head].num_params(2)
+    first, second = (
+        HEADS[head].make(0.3 * jax.random.normal(jax.random.key(seed), (num,))) for seed in (0, 1)
+    )
+    assert float(first.kl(first)) == pytest.approx(0, abs=1e-6)
+    if head == "gaussian":  # samples are clipped, the divergence is that of the density
+        noise = jax.random.normal(jax.random.key(2), (100_000, 2))
+        actions = first.mean + jnp.exp(first.log_std) * noise
+    else:
+        actions = jax.vmap(first.sample)(jax.random.split(jax.random.key(2), 100_000))
+    ratios = jax.vmap(lambda a: first.log_prob(a) - second.log_prob(a))(actions)
+    error = 4 * float(ratios.std()) / 100_000**0.5
+    assert float(first.kl(second)) == pytest.approx(float(ratios.mean()), abs=error)
+
+
+def test_mixtures_have_no_divergence_and_are_refused() -> None:
+    mixture = HEADS["mixture"].make(jnp.zeros(HEADS["mixture"].num_params(2)))
+    with pytest.raises(NotAvailableError, match="no closed form"):
+        mixture.kl(mixture)
+    mixed = replace(SETTING, network=replace(NETWORK, head="mixture"))
+    for name in ("ppo", "ppo-careful", "reinforce", "reinforce-careful"):
+        method = methods.find(name)
+        with pytest.raises(UsageError, match="pre-train with --head binned"):
+            method.check_use(mixed, method.hyper())
+        method.check_use(SETTING, method.hyper())
+
+
+@pytest.mark.parametrize("tune", ["all", "head", "lora"])
+def test_a_part_starts_as_the_network_that_it_is_of(params: Any, tune: str) -> None:
+    part = subset(tune, params, rank=2)
+    start = part.start(jax.random.key(0))
+    assert_equal(part.merge(start), params)
+    moved = part.merge(jax.tree.map(lambda leaf: leaf + 1, start))
+    same = jax.tree.map(lambda a, b: bool((a == b).all()), moved, params)["params"]
+    expected = {
+        "all": set(),
+        "head": {layer for layer in same if layer not in ("norm_out", "head")},
+        "lora": {layer for layer in same if not layer.startswith("blocks")},
+    }[tune]
+    assert {layer for layer, flags in same.items() if all(jax.tree.leaves(flags))} == expected
+
+
+def sampled_bc(params: Any) -> Adapter:
+    """Goal-conditioned BC that samples, in rounds of five episodes."""
+    fixed = fixed_prompt(NETWORK.max_prompt_length)
+
+    def ask(key: Any, state: Any) -> Any:
+        query, state = fixed.ask(key, state)
+        return query._replace(greedy=jnp.zeros((), bool)), state
+
+    optimizer = PromptOptimizer(fixed.init, ask, fixed.tell, fixed.best)
+    policy = transformer_policy(NETWORK, params)
+    return prompt_adapter(policy, optimizer)._replace(episodes_per_round=5)
+
+
+@pytest.mark.parametrize("make", [make_ppo, make_reinforce])
+def test_without_a_learning_rate_it_is_sampled_behavior_cloning(params: Any, make: Any) -> None:
+    still = {"learning_rate": 0.0, "weight_decay": 0.0}
+    hyper = PpoHyper(**still) if make is make_ppo else ReinforceHyper(**still)
+    run = jax.jit(search, static_argnums=(1, 2, 4))
+    found, wanted = (
+        run(jax.random.key(5), ENV, adapter, TASK, 20).log
+        for adapter in (make(SETTING, params, hyper), sampled_bc(params))
+    )
+    assert_equal(found.returns, wanted.returns)
+    assert_equal(found.played.actions, wanted.played.actions)
+
+
+def test_steps_after_the_end_change_nothing(round_of_episodes: Any) -> None:
+    adapter, state, query, episodes = round_of_episodes
+    trajectory = episodes.trajectory
+    over = jnp.arange(ENV.horizon) >= trajectory.length[:, None]
+    noisy = episodes._replace(
+        trajectory=trajectory._replace(
+            obs=jnp.where(over[..., None], 7.0, trajectory.obs),
+            actions=jnp.where(over, 1, trajectory.actions),
+        )
+    )
+    tell = jax.jit(adapter.tell)
+    first, second = (tell(jax.random.key(4), state, query, each) for each in (episodes, noisy))
+    assert_equal(first.weights, second.weights)
+
+
+def test_the_first_gradient_is_that_of_the_advantages(round_of_episodes: Any, params: Any) -> None:
+    """At the ratio 1 PPO's gradient is the policy gradient; AdamW's first step is its sign."""
+    _, _, query, episodes = round_of_episodes
+    hyper = PpoHyper(epochs=1, weight_decay=0.0, value_weight=0.0, clip_norm=1e9)
+    adapter = make_ppo(SETTING, params, hyper)
+    state = adapter.init(jax.random.key(1), GOAL)
+    after = jax.jit(adapter.tell)(jax.random.key(4), state, query, episodes).weights.policy
+
+    trajectory = episodes.trajectory
+    real = jnp.arange(ENV.horizon) < trajectory.length[:, None]
+    zero = jnp.zeros(ENV.horizon)
+    gains = jax.vmap(advantages, (0, None, 0, None, None))(episodes.rewards, zero, real, 0.98, 0.95)
+    gains = jnp.where(real, (gains - gains[real].mean()) / gains[real].std(), 0)
+
+    def objective(params: Any) -> Any:
+        apply = lambda o, a: GoalTransformer(NETWORK).apply(params, query.prompt, o, a)  # noqa: E731
+        log_probs = jax.vmap(apply)(trajectory.obs, trajectory.actions).log_prob(trajectory.actions)
+        return jnp.sum(gains * log_probs) / real.sum()
+
+    grads = jax.jit(jax.grad(objective))(params)
+    for moved, before, grad in zip(*map(jax.tree.leaves, (after, params, grads)), strict=True):
+        clear = jnp.abs(grad) > 1e-4
+        step = (moved - before)[clear]
+        np.testing.assert_allclose(step, 1e-4 * jnp.sign(grad[clear]), atol=2e-6)
+
+
+@pytest.mark.parametrize("hyper", [PpoHyper(), CarefulPpoHyper(tune="lora")])
+def test_lanes_side_by_side_equal_single_ones(params: Any, hyper: Any) -> None:
+    adapter = make_ppo(SETTING, params, hyper)
+    keys = jax.random.split(jax.random.key(6), 3)
+    run = lambda key: search(key, ENV, adapter, TASK, 10).log.returns  # noqa: E731
+    together = jax.jit(jax.vmap(run))(keys)
+    single = jax.jit(run)
+    np.testing.assert_array_equal(together, jnp.stack([single(key) for key in keys]))
+
+
+FAST = {"learning_rate": 0.01, "weight_decay": 0.0, "warmup_rounds": 0}
+
+
+@pytest.mark.parametrize(
+    ("make", "hyper"),
+    [
+        (make_ppo, PpoHyper(**FAST, value_rate=0.01)),
+        (make_ppo, CarefulPpoHyper(**FAST, max_kl=None)),
+        (make_reinforce, ReinforceHyper(**FAST)),
+        (make_reinforce, CarefulReinforceHyper(**FAST)),
+    ],
+    ids=["ppo", "ppo-careful", "reinforce", "reinforce-careful"],
+)
+def test_a_chain_is_learned(params: Any, make: Any, hyper: Any) -> None:
+    adapter = make(SETTING, params, hyper)
+    runs = jax.jit(jax.vmap(lambda key: search(key, ENV, adapter, TASK, 200).log.returns))
+    returns = runs(jax.random.split(jax.random.key(7), 4)).reshape(4, -1)
+    assert returns[:, -20:].mean() > 0.95 > returns[:, :20].mean() + 0.2
+
+
+def test_a_strong_penalty_keeps_the_policy(params: Any, round_of_episodes: Any) -> None:
+    _, _, query, episodes = round_of_episodes
+    hyper = PpoHyper(learning_rate=1e-3, epochs=100)
+    tell = lambda kl: make_ppo(SETTING, params, replace(hyper, kl=kl)).tell  # noqa: E731
+    start = make_ppo(SETTING, params, PpoHyper()).init(jax.random.key(1), GOAL)
+
+    def moved(kl: float) -> float:
+        state = jax.jit(tell(kl))(jax.random.key(4), start, query, episodes)
+        trajectory = episodes.trajectory
+        network = GoalTransformer(NETWORK)
+        now, before = (
+            network.apply(weights, query.prompt, trajectory.obs[0], trajectory.actions[0])
+            for weights in (state.weights.policy, params)
+        )
+        return float(now.kl(before).mean())
+
+    assert moved(100.0) < 0.2 * moved(0.0)
+
+
+def test_a_round_ends_when_the_policy_has_moved_too_far(
+    params: Any, round_of_episodes: Any
+) -> None:
+    """With a bound that the first step breaks, four epochs are as one."""
+    _, state, query, episodes = round_of_episodes
+
+    def after(**changes: Any) -> Any:
+        adapter = make_ppo(SETTING, params, PpoHyper(learning_rate=0.01, **changes))
+        return jax.jit(adapter.tell)(jax.random.key(4), state, query, episodes).weights
+
+    assert_close(after(epochs=4, max_kl=1e-9), after(epochs=1), 1e-6)
+    assert_close(after(epochs=4, max_kl=1e9), after(epochs=4), 1e-6)
+
+
+def test_values_alone_are_learned_at_first(params: Any, round_of_episodes: Any) -> None:
+    """They approach the discounted returns, while the policy stays as it was."""
+    _, _, query, episodes = round_of_episodes
+    hyper = PpoHyper(
+        epochs=400, value_rounds=1, value_rate=0.05, share_trunk=False, weight_decay=0.0,
+        clip_norm=1e9, gae_lambda=1.0,
+    )  # fmt: skip
+    adapter = make_ppo(SETTING, params, hyper)
+    state = adapter.init(jax.random.key(1), GOAL)
+    state = jax.jit(adapter.tell)(jax.random.key(4), state, query, episodes)
+    assert_equal(state.weights.policy, params)
+    real = jnp.arange(ENV.horizon) < episodes.trajectory.length[:, None]
+    look = lambda obs, actions: GoalTransformer(NETWORK).apply(  # noqa: E731
+        params, query.prompt, obs, actions, method="features"
+    )
+    features = jax.vmap(look)(episodes.trajectory.obs, episodes.trajectory.actions)
+    returns = jax.vmap(returns_to_go, (0, None))(episodes.rewards, 0.98)
+    missed = (state.weights.value(features) - returns)[real]
+    assert float((missed**2).mean()) < 0.5 * float((returns[real] ** 2).mean())
