@@ -298,6 +298,34 @@ class Environment:
             f"{self.spec.name} draws no goals at random (its class does not define sample_goal)"
         )
 
+    @property
+    def goal_set(self) -> np.ndarray:
+        """The goals that an agent can be told to reach one at a time, [N, G].
+
+        Raises:
+          NotAvailableError: by default. Methods that choose among goals then cannot be used.
+        """
+        raise NotAvailableError(
+            f"{self.spec.name} has no list of goals to choose from (its class does not define goal_set)"
+        )
+
+    def expert_goal(self, state: State, num_steps: int) -> Float[Array, "G"]:
+        """The goal to go for from a state on, told by somebody who knows the task and everything else.
+
+        It is what tells how good a hierarchy can be whose high level needs to learn nothing.
+
+        Args:
+          state: of an episode in progress.
+          num_steps: number of steps until the next goal is told.
+
+        Raises:
+          NotAvailableError: by default.
+        """
+        del state, num_steps
+        raise NotAvailableError(
+            f"{self.spec.name} tells no goals to go for (its class does not define expert_goal)"
+        )
+
     def fingerprint(self, task: Task) -> Int[Array, "F"]:
         """What must differ between the tasks of training and test (default: all bytes of the task)."""
         leaves = [_without_key(jnp.asarray(leaf)) for leaf in jax.tree.leaves(task)]

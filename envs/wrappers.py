@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from envs.base import Engine, Environment, EnvSpec, State, Task, TimeStep
@@ -48,6 +49,13 @@ class Wrapper(Environment):
 
     def num_parts(self, task: Task) -> Int[Array, ""]:
         return self.env.num_parts(task)
+
+    @property
+    def goal_set(self) -> np.ndarray:
+        return self.env.goal_set
+
+    def expert_goal(self, state: State, num_steps: int) -> Float[Array, "G"]:
+        return self.env.expert_goal(state, num_steps)
 
     def fingerprint(self, task: Task) -> Int[Array, "F"]:
         return self.env.fingerprint(task)
@@ -133,6 +141,9 @@ class Noisy(Wrapper):
         key, key_action, key_obs = jax.random.split(state.key, 3)
         inner, timestep = self.env.step(state.inner, self._disturb(key_action, action))
         return NoisyState(inner, key), self._blur(key_obs, timestep)
+
+    def expert_goal(self, state: NoisyState, num_steps: int) -> Float[Array, "G"]:
+        return self.env.expert_goal(state.inner, num_steps)
 
     def _disturb(self, key: PRNGKeyArray, action: Array) -> Array:
         if not self.env.spec.discrete:

@@ -50,7 +50,7 @@ def main(config: AdaptConfig) -> None:
     from mgpo_jax.policy_files import load_policy
 
     env = envs.make(config.env)
-    policy = load_policy(world, config.policy)
+    policy = load_policy(world, config.policy, methods.find(config.method).policy)
     tasks = chosen_tasks(world, env, config.tasks, config.validation)
     if folder.is_dir():
         results = finished(folder, config, policy, tasks)

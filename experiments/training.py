@@ -15,7 +15,7 @@ from jaxtyping import Array, PRNGKeyArray
 import envs
 from envs.base import Demonstrator, Environment, Task
 from envs.episodes import run_episode
-from envs.errors import DataError
+from envs.errors import DataError, UsageError
 from envs.registry import World
 from experiments.datasets import find_demonstrator, prepare_dataset
 from experiments.figures import training_curve
@@ -33,6 +33,7 @@ from mgpo_jax.checkpoint import Snapshot, checkpoints, restore_state, save_state
 from mgpo_jax.claims import claimed
 from mgpo_jax.dataset import BatchPlan, Dataset
 from mgpo_jax.files import remove_unfinished, to_json, written
+from mgpo_jax.kinds import KINDS, MULTI_GOAL, kind_of
 from mgpo_jax.optimizers.methods import judged_query
 from mgpo_jax.policy import LoadedPolicy, transformer_policy
 from mgpo_jax.policy_files import MEND, read_policy, save_policy
@@ -43,7 +44,7 @@ from mgpo_jax.runner import together
 from mgpo_jax.sharding import device_mesh, largest_divisor
 from mgpo_jax.tasks import EVAL_SEED, evaluation_tasks
 from mgpo_jax.training import Trainer, TrainState, batch_stream, diverged, finite_metrics
-from mgpo_jax.transformer import TransformerConfig, network_config
+from mgpo_jax.transformer import NetworkConfig, TransformerConfig, world_side
 
 CONSTANT = 1e-4  # below this standard deviation a component of an observation stays unscaled
 PERFECT = 1e-3  # a demonstration whose return is this near to the optimum counts as perfect
@@ -59,9 +60,13 @@ def initial_policy(config: PretrainConfig, env: Environment) -> LoadedPolicy | N
     if config.init is None:
         return None
     try:
-        policy = read_policy(initial_folder(config), env.spec)
+        policy = read_policy(initial_folder(config), env.spec, config.method)
     except DataError as error:
         raise DataError(str(error).replace(MEND, mend_initial(config))) from None
+    if (found := kind_of(policy.config).name) != config.method:
+        raise UsageError(
+            f"--method {config.method} cannot start from {config.init}, a network of the kind {found}"
+        )
     runs.check_same_start(config, policy.sha256)
     check_initial(config)
     return policy
@@ -69,12 +74,15 @@ def initial_policy(config: PretrainConfig, env: Environment) -> LoadedPolicy | N
 
 def configured_network(
     config: PretrainConfig, env: Environment, dataset: Dataset, init: LoadedPolicy | None = None
-) -> TransformerConfig:
+) -> Any:
     """The network of a run: that of the policy it starts from, or one of the settings both configs have."""
     if init is not None:
         return replace(init.config, dropout=config.dropout)
-    common = {f.name for f in fields(TransformerConfig)} & {f.name for f in fields(PretrainConfig)}
-    network = network_config(env.spec, **{name: getattr(config, name) for name in common})
+    learned = KINDS.find(config.method).load()
+    common = {f.name for f in fields(learned.config)} & {f.name for f in fields(PretrainConfig)}
+    sizes = {name: getattr(config, name) for name in common}
+    sizes |= world_side(env.spec, config.head, config.encoder)
+    network = learned.complete(learned.config(**sizes), env, dataset)
     if not config.standardize_obs:
         return network
     rows = dataset.obs.reshape(len(dataset.obs), -1)
@@ -159,6 +167,40 @@ class ReturnsOnTheWay:
         return {name + tail: float(values[one].mean()) for tail, one in groups.items() if one.any()}
 
 
+class ReturnsByItself:
+    """Mean returns of a network that follows no prompts, as its kind says, on tasks of its own."""
+
+    def __init__(self, world: World, env: Environment, network: NetworkConfig, num: int) -> None:
+        agent = kind_of(network).load().agent
+        assert agent is not None  # as ``watched`` sees to
+        self._tasks = evaluation_tasks(env, num, world.num_test_tasks)
+        self._keys = jax.random.split(jax.random.key(EVAL_SEED), num)
+
+        def return_of(params: Any, key: PRNGKeyArray, task: Task) -> Array:
+            acting = agent(network, params, env.task_goal(task), world.judged)
+            return run_episode(key, env, acting, task).return_
+
+        self._returns = together(env, return_of, in_axes=(None, 0, 0))
+
+    def __call__(self, params: Any) -> dict[str, float]:
+        """The numbers for some weights."""
+        returns = self._returns(params, self._keys, self._tasks)
+        return {"eval/initial_return": float(np.mean(returns))}
+
+
+def watched(
+    world: World,
+    env: Environment,
+    network: NetworkConfig,
+    demonstrator: Demonstrator,
+    num: int,
+) -> Callable[[Any], dict[str, float]]:
+    """``(params) -> returns`` that a training watches on ``num`` tasks."""
+    if isinstance(network, TransformerConfig) and kind_of(network).name == MULTI_GOAL:
+        return ReturnsOnTheWay(world, env, network, demonstrator, num)
+    return ReturnsByItself(world, env, network, num)
+
+
 class Run:
     """A training under way: its data, its trainer and what measures it.
 
@@ -169,7 +211,7 @@ class Run:
         self.config, self.folder = config, config.folder
         world, env = envs.find(config.env), envs.make(config.env)
         self.init = init = initial_policy(config, env)
-        network_config(env.spec, config.head, encoder=config.encoder)  # complains about a bad one
+        world_side(env.spec, config.head, config.encoder)  # complains about a bad head or encoder
         check_loggers(config)
         meta = provenance()
         dataset, place, sha256 = prepare_dataset(config, world, env, go_on)
@@ -182,7 +224,7 @@ class Run:
         self.truncate = env.spec.truncate_in_hindsight
         self._held_out_parts = self._validation_parts(held_out, env.spec.horizon)
         _, demonstrator = find_demonstrator(world, env, config.data.demonstrator)
-        self._returns_on_the_way = ReturnsOnTheWay(
+        self._returns_on_the_way = watched(
             world, env, self.network, demonstrator, config.eval_tasks
         )
         self.identity = runs.identity(config, sha256, init.sha256 if init else "")

@@ -13,7 +13,7 @@ from envs.episodes import segment_length
 from envs.errors import UsageError
 from mgpo_jax.policy import LoadedPolicy, transformer_policy
 from mgpo_jax.prompts import Prompt, prompt_of
-from mgpo_jax.rollout import Query, act
+from mgpo_jax.rollout import act
 from mgpo_jax.transformer import TransformerConfig
 
 
@@ -107,7 +107,7 @@ class Actor:
 
     def _choose(self, distribution: Any) -> np.ndarray:
         self._key, key = jax.random.split(self._key)
-        self._action = act(key, distribution, Query(self._prompt, self._greedy))
+        self._action = act(key, distribution, self._greedy)
         return np.asarray(self._action)
 
     def _checked(self, obs: Any) -> jax.Array:

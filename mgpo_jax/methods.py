@@ -17,6 +17,7 @@ from annotated_types import Ge, Gt, Le
 
 from envs.errors import UsageError
 from envs.registry import Judgement, Registry, World
+from mgpo_jax.kinds import MULTI_GOAL, kind_of
 from mgpo_jax.settings import (
     NotNegative,
     NumGoals,
@@ -28,7 +29,6 @@ from mgpo_jax.settings import (
 if TYPE_CHECKING:
     from envs.base import Environment
     from mgpo_jax.adaptation import Adapter
-    from mgpo_jax.transformer import TransformerConfig
 
 
 @dataclass(frozen=True)
@@ -37,13 +37,13 @@ class Setting:
 
     Attributes:
       env: the world.
-      network: the network of the policy.
+      network: the sizes of the network that the method starts from.
       num_episodes: the budget of episodes for one task.
       judged: how the world judges policies.
     """
 
     env: Environment
-    network: TransformerConfig
+    network: Any
     num_episodes: int
     judged: Judgement
 
@@ -65,6 +65,7 @@ class Method:
       hyper: the frozen dataclass of its hyper-parameters; flags, help and checks are made from it.
       check: ``(setting, hyper) -> None``, or its place, raises ``UsageError`` where the method cannot be
         used.
+      policy: the kind of network that it starts from (``kinds.KINDS``).
       title: its name in legends [the name].
       summary: what it is, in one line.
     """
@@ -73,6 +74,7 @@ class Method:
     make: str | Callable[[Setting, Any, Any], Adapter]
     hyper: type = NoHyper
     check: str | Callable[[Setting, Any], None] | None = None
+    policy: str = MULTI_GOAL
     title: str = ""
     summary: str = ""
 
@@ -88,6 +90,7 @@ class Method:
                 f"{type(hyper).__name__}"
             )
         check_settings(hyper)
+        check_kind(kind_of(setting.network).name, self)
         if self.check is not None:
             load(self.check)(setting, hyper)
 
@@ -111,6 +114,15 @@ class Method:
             if name not in own:
                 raise foreign_setting(name, self)
         return self.hyper(**values)
+
+
+def check_kind(found: str, method: Method) -> None:
+    """Raise ``UsageError`` for a policy of another kind than a method starts from."""
+    if found != method.policy:
+        raise UsageError(
+            f"{method.name} starts from a network of the kind {method.policy}, this one is of the kind "
+            f"{found}; train one with `python -m experiments.pretrain --method {method.policy}`"
+        )
 
 
 def load(place: str | Callable) -> Callable:
@@ -227,10 +239,14 @@ METHODS: Registry[Method] = Registry(
         },
         **{
             name: f"mgpo_jax.baselines.methods:{name.upper().replace('-', '_')}"
-            for name in ("reinforce", "reinforce-careful", "ppo", "ppo-careful")
+            for name in (
+                "reinforce", "reinforce-careful", "ppo", "ppo-careful",
+                "ptgm", "ptgm-goal", "ptgm-random", "ptgm-prior", "ptgm-oracle",
+                "spirl", "spirl-prior",
+            )
         },
     },
-)
+)  # fmt: skip
 
 UCB = Method(
     name="ucb",
@@ -278,6 +294,11 @@ GCBC = Method(
     summary="goal-conditioned behavior cloning; the prompt stays (g^M) in every episode",
     make=f"{_HERE}:make_gcbc",
 )
+
+
+def policy_kind(name: str) -> str:
+    """The kind of network that a method starts from; of a method that is not known, one for prompts."""
+    return METHODS.find(name).policy if name in METHODS.names() else MULTI_GOAL
 
 
 def register(method: Method) -> Method:

@@ -8,7 +8,12 @@ from typing import Any, NamedTuple
 
 from envs.base import EnvSpec
 from envs.errors import DataError
-from mgpo_jax.transformer import GoalTransformer, TransformerConfig, grow_cache
+from mgpo_jax.transformer import (
+    GoalTransformer,
+    NetworkConfig,
+    TransformerConfig,
+    grow_cache,
+)
 
 
 class Policy(NamedTuple):
@@ -27,7 +32,9 @@ class Policy(NamedTuple):
 class LoadedPolicy(NamedTuple):
     """A network, its weights and how it was made."""
 
-    config: TransformerConfig
+    config: Any
+    """The network's sizes, a ``transformer.NetworkConfig``; of the policy that follows prompts a
+    ``TransformerConfig``."""
     params: Any
     made: dict[str, Any]
     sha256: str = ""
@@ -41,7 +48,7 @@ class LoadedPolicy(NamedTuple):
         return transformer_policy(self.config, self.params)
 
 
-def check_fits(config: TransformerConfig, spec: EnvSpec, who: str = "the policy") -> None:
+def check_fits(config: NetworkConfig, spec: EnvSpec, who: str = "the policy") -> None:
     """Raise ``DataError`` if a network was made for another world than that of ``spec``."""
     facts = {
         "discrete actions": (config.head == "categorical", spec.discrete),

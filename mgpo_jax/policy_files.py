@@ -36,8 +36,8 @@ from mgpo_jax.files import (
     write_arrays,
     write_json,
 )
+from mgpo_jax.kinds import KINDS, MULTI_GOAL, kind_of
 from mgpo_jax.policy import LoadedPolicy, check_fits
-from mgpo_jax.prompts import single_goal
 from mgpo_jax.released import released_folder
 from mgpo_jax.schema import (
     STRICT,
@@ -51,7 +51,7 @@ from mgpo_jax.schema import (
     read_document,
 )
 from mgpo_jax.settings import ENCODERS, Index
-from mgpo_jax.transformer import GoalTransformer, TransformerConfig
+from mgpo_jax.transformer import NetworkConfig, TransformerConfig
 
 FORMAT = 2  # 1 had flat observations of size obs_dim
 WEIGHTS = "weights.npz"
@@ -65,7 +65,7 @@ DTYPES = (
 """The dtypes that observations may have."""
 
 
-def save_policy(folder: Path, config: TransformerConfig, params: Any, made: dict[str, Any]) -> None:
+def save_policy(folder: Path, config: NetworkConfig, params: Any, made: dict[str, Any]) -> None:
     """Write a policy, which replaces one that is there; other files beside that one stay.
 
     However the process ends, the folder holds the old policy or the new one, whole.
@@ -85,6 +85,8 @@ def save_policy(folder: Path, config: TransformerConfig, params: Any, made: dict
         if not np.isfinite(array).all():
             raise DataError(f"{folder} is not written: weight {name} holds NaN or infinity")
     document = {"format": FORMAT, "network": dataclasses.asdict(config), "made": made}
+    if (kind := kind_of(config).name) != MULTI_GOAL:
+        document["kind"] = kind
     _finish_exchange(folder)
     if folder.is_dir():
         _exchange(folder.resolve(), arrays, document)
@@ -138,27 +140,44 @@ def _write_policy(
     write_json(folder / CONFIG, {**document, "sha256": hash_file(folder / WEIGHTS)})
 
 
-def load_policy(world: World | str, path: Path | str | None = None) -> LoadedPolicy:
+def load_policy(
+    world: World | str, path: Path | str | None = None, kind: str = MULTI_GOAL
+) -> LoadedPolicy:
     """The policy in a folder (default: the released one), checked against the world.
 
     Args:
       world: the world, its name, or its place as ``module:attribute``.
       path: folder of a policy.
+      kind: the kind of network that it must be (default: one that follows prompts).
 
     Raises:
-      UsageError: if there is no policy at that place.
+      UsageError: if there is no policy at that place, or one of another kind.
       DataError: if the files are damaged or do not fit the world.
     """
     world = find(world) if isinstance(world, str) else world
-    return read_policy(Path(path) if path else released_folder(world), world.make().spec)
+    folder = Path(path) if path else released_folder(world, kind)
+    policy = read_policy(folder, world.make().spec, kind)
+    found = kind_of(policy.config).name
+    if found != kind:
+        raise UsageError(
+            f"the network in {folder} is of the kind {found}, one of the kind {kind} is needed; train it "
+            f"with `python -m experiments.pretrain --env {world.name}{method_flag(kind)}`"
+        )
+    return policy
 
 
-def read_policy(folder: Path, spec: EnvSpec | None = None) -> LoadedPolicy:
+def method_flag(kind: str) -> str:
+    """The flag with which a kind of network is trained; empty for the one that follows prompts."""
+    return "" if kind == MULTI_GOAL else f" --method {kind}"
+
+
+def read_policy(folder: Path, spec: EnvSpec | None = None, kind: str = MULTI_GOAL) -> LoadedPolicy:
     """Read a policy from its folder.
 
     Args:
       folder: where ``save_policy`` wrote it.
       spec: the world it must fit.
+      kind: the kind of network that is looked for, for the message that there is none.
 
     Raises:
       UsageError: if there is no policy at that place.
@@ -168,7 +187,7 @@ def read_policy(folder: Path, spec: EnvSpec | None = None) -> LoadedPolicy:
     if not (folder / CONFIG).is_file():
         raise UsageError(
             f"no policy in {folder} ({CONFIG} is missing); give the folder of one with --policy or "
-            "train one with `python -m experiments.pretrain`"
+            f"train one with `python -m experiments.pretrain{method_flag(kind)}`"
         )
     document = _read_config(folder)
     network, path = document.network, folder / WEIGHTS
@@ -176,7 +195,8 @@ def read_policy(folder: Path, spec: EnvSpec | None = None) -> LoadedPolicy:
         raise DataError(
             f"{path} is missing, truncated or differs from the hash in {CONFIG}; {MEND}"
         )
-    _check_blocks(path, network)
+    if isinstance(network, TransformerConfig):
+        _check_blocks(path, network)
     fields = {
         name: ArrayField(like.shape, str(like.dtype))
         for name, like in flatten_dict(_shapes(network), sep="/").items()
@@ -197,6 +217,7 @@ class _Document(BaseModel):
     sha256: Sha256
     network: dict[str, Json]
     made: dict[str, Json]
+    kind: Name = MULTI_GOAL
 
 
 SIZES = ("embed_dim", "num_layers", "num_heads", "max_prompt_length")  # never left to a default
@@ -214,7 +235,7 @@ class _Made(BaseModel):
 
 
 class _Config(NamedTuple):
-    network: TransformerConfig
+    network: NetworkConfig
     made: dict[str, Any]
     sha256: str
 
@@ -231,16 +252,18 @@ def _read_config(folder: Path) -> _Config:
     if document.format == 1 and "obs_dim" in network:
         network = {**network, "obs_shape": [network["obs_dim"]]}
         del network["obs_dim"]
-    if missing := [name for name in SIZES if name not in network]:
+    learned = KINDS.known(document.kind, path).load()
+    sizes = [name for name in SIZES if name in {f.name for f in dataclasses.fields(learned.config)}]
+    if missing := [name for name in sizes if name not in network]:
         raise DataError(f"{path} lacks network.{missing[0]}; {MEND}")
-    config = checked_entry(network, TransformerConfig, path, "network", MEND)
+    config = checked_entry(network, learned.config, path, "network", MEND)
     checked_entry(document.made, _Made, path, "made", MEND)
-    if said := _fault(config):
+    if said := _fault(config) or learned.fault(config):
         raise DataError(f"{path}: network.{said}; {MEND}")
     return _Config(config, document.made, document.sha256)
 
 
-def _fault(config: TransformerConfig) -> str | None:
+def _fault(config: NetworkConfig) -> str | None:
     """What of a network does not fit together, after its types and ranges have been found right."""
     if config.head not in HEADS:
         return f"head must be one of {', '.join(HEADS)}, found {shown(config.head)}"
@@ -248,7 +271,7 @@ def _fault(config: TransformerConfig) -> str | None:
         return f"encoder must be one of {', '.join(known)}, found {shown(config.encoder)}"
     if config.obs_dtype not in DTYPES:
         return f"obs_dtype must be one of {', '.join(DTYPES)}, found {shown(config.obs_dtype)}"
-    if config.embed_dim % config.num_heads:
+    if isinstance(config, TransformerConfig) and config.embed_dim % config.num_heads:
         return f"num_heads must divide embed_dim {config.embed_dim}, found {config.num_heads}"
     size = ArraySpec(config.obs_shape, config.obs_dtype).size
     for name in ("obs_mean", "obs_std"):
@@ -257,7 +280,7 @@ def _fault(config: TransformerConfig) -> str | None:
     return _layout_fault(config)
 
 
-def _layout_fault(config: TransformerConfig) -> str | None:
+def _layout_fault(config: NetworkConfig) -> str | None:
     """What is wrong with the layout of observations in a network's config."""
     layout = config.obs_layout
     encoder = ENCODERS.find(config.encoder)
@@ -281,14 +304,7 @@ def _check_blocks(path: Path, config: TransformerConfig) -> None:
         )
 
 
-def _shapes(config: TransformerConfig) -> Any:
+def _shapes(config: NetworkConfig) -> Any:
     """Shapes of the params, without computing them."""
-
-    def init() -> Any:
-        prompt = single_goal(jnp.zeros(config.goal_dim), config.max_prompt_length)
-        discrete = config.head == "categorical"
-        actions = jnp.zeros(1, jnp.int32) if discrete else jnp.zeros((1, config.action_dim))
-        obs = jnp.zeros((1, *config.obs_shape), config.obs_dtype)
-        return GoalTransformer(config).init(jax.random.key(0), prompt, obs, actions)
-
-    return jax.eval_shape(init)
+    init = kind_of(config).load().init
+    return jax.eval_shape(lambda: init(jax.random.key(0), config))

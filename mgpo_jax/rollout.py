@@ -30,12 +30,15 @@ def rollout(
     return run_episode(key, env, prompted(policy, query), task)
 
 
-def act(key: PRNGKeyArray, distribution: Any, query: Query) -> Array:
-    """An action from a distribution, as a query wants it."""
-    explored = distribution
-    if query.temperature is not None:
-        explored = distribution.tempered(query.temperature)
-    return jnp.where(query.greedy, distribution.mode(), explored.explore(key))
+def act(
+    key: PRNGKeyArray,
+    distribution: Any,
+    greedy: Bool[Array, ""],
+    temperature: Float[Array, ""] | None = None,
+) -> Array:
+    """An action from a distribution: its mode, or a random one at a temperature."""
+    explored = distribution if temperature is None else distribution.tempered(temperature)
+    return jnp.where(greedy, distribution.mode(), explored.explore(key))
 
 
 def prompted(policy: Policy, query: Query) -> Agent:
@@ -43,13 +46,13 @@ def prompted(policy: Policy, query: Query) -> Agent:
 
     def begin(key: PRNGKeyArray, task: Task, state: State, timestep: TimeStep) -> tuple:
         distribution, carry = policy.prefill(query.prompt, timestep.obs)
-        action = act(key, distribution, query)
+        action = act(key, distribution, query.greedy, query.temperature)
         return action, jnp.zeros((), bool), (carry, action)
 
     def proceed(key: PRNGKeyArray, memory: tuple, state: State, timestep: TimeStep) -> tuple:
         carry, action = memory
         distribution, carry = policy.decode(carry, action, timestep.obs)
-        action = act(key, distribution, query)
+        action = act(key, distribution, query.greedy, query.temperature)
         return action, jnp.zeros((), bool), (carry, action)
 
     def grow(memory: tuple, num_steps: int) -> tuple:

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import Array, Bool, PRNGKeyArray
 
 from envs.base import Environment, Episode, Goals, Task
 from envs.errors import DataError, UsageError
@@ -494,6 +494,7 @@ def _run(
             log = jax.tree.map(lambda rows, n=num: rows[: grid.size, :n], log)
             judged = jax.tree.map(lambda rows: rows[: grid.size], judged)
             _check_finite(log, judged, grid, before)
+            _check_sound(state.search, grid, before + num)
             done.append(Segment(log, judged, cpu))
             _keep(journal, number, done[-1], state, grid)
             progress.update(num * per_round)
@@ -522,6 +523,28 @@ def _check_finite(log: AdaptLog, judged: Judged, grid: Grid, rounds_before: int)
         f"the return of {what} on task {task} with seed number {seed} is {value}; the world or the policy "
         "is broken"
     )
+
+
+@jax.jit
+def _broken(searches: Any) -> Bool[Array, "lanes"]:
+    """Which searches hold NaN in their states."""
+    numbers = [
+        leaf for leaf in jax.tree.leaves(searches) if jnp.issubdtype(leaf.dtype, jnp.floating)
+    ]
+    found = [jnp.isnan(leaf).reshape(len(leaf), -1).any(axis=1) for leaf in numbers]
+    return jnp.any(jnp.stack(found), axis=0)
+
+
+def _check_sound(searches: Any, grid: Grid, rounds: int) -> None:
+    """Raise ``DataError`` for the first search whose state holds NaN, such as weights that diverged."""
+    if not any(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in jax.tree.leaves(searches)):
+        return
+    if (broken := fetch(_broken(searches))[: grid.size]).any():
+        seed, task = divmod(int(np.argmax(broken)) % (grid.seeds * grid.tasks), grid.tasks)
+        raise DataError(
+            f"the search on task {task} with seed number {seed} has diverged: what it learned holds NaN "
+            f"after {rounds} rounds; lower its learning rate"
+        )
 
 
 def _keep(journal: Journal, number: int, segment: Segment, state: Any, grid: Grid) -> None:

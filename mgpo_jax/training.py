@@ -24,6 +24,7 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray
 from envs.base import EnvSpec, Trajectory
 from envs.errors import DataError, UsageError
 from mgpo_jax.dataset import BatchPlan, Dataset, check_dataset, plan_batches
+from mgpo_jax.kinds import Learned, kind_of
 from mgpo_jax.policy import LoadedPolicy, check_fits
 from mgpo_jax.progress import Progress
 from mgpo_jax.prompts import hindsight_outcome, sample_prompt, single_goal
@@ -43,7 +44,12 @@ from mgpo_jax.sharding import (
     split,
     spread,
 )
-from mgpo_jax.transformer import GoalTransformer, TransformerConfig, network_config
+from mgpo_jax.transformer import (
+    GoalTransformer,
+    NetworkConfig,
+    TransformerConfig,
+    network_config,
+)
 
 FINITE = "weights_finite"  # a flag among the metrics of a step, which is no figure
 HIT = 0.1  # per-dimension tolerance for counting a predicted action as correct
@@ -63,9 +69,46 @@ class Stats(NamedTuple):
     """Sums over real steps."""
 
     nll: Float[Array, "*batch"]
+    """Of the actions."""
     correct: Float[Array, "*batch"]
     """Steps whose likeliest action is the demonstrated (intended) one, within ``HIT`` in each dimension."""
     num_steps: Float[Array, "*batch"]
+    parts: dict[str, Float[Array, "*batch"]]
+    """Other parts of the loss, by name, for kinds of networks that learn more than actions."""
+
+    @property
+    def divisor(self) -> Any:
+        """The number of steps, or 1 where there are none."""
+        return self.num_steps + (self.num_steps == 0)
+
+    @property
+    def means(self) -> dict[str, Any]:
+        """Means over the steps, by the names of metrics."""
+        sums = {"loss": self.nll, "accuracy": self.correct, **self.parts}
+        return {name: total / self.divisor for name, total in sums.items()}
+
+
+def stats_of(distribution: Any, labels: Array, counts: Array, **parts: Array) -> Stats:
+    """The statistics of some action distributions.
+
+    Args:
+      distribution: of the actions, [*steps].
+      labels: the actions demonstrated (intended), [*steps] or [*steps, A].
+      counts: which steps count, bool [*steps].
+      **parts: other parts of the loss at every step, [*steps].
+    """
+
+    def total(values: Array) -> Array:
+        return jnp.sum(jnp.where(counts, values, 0.0))
+
+    hits = jnp.abs(distribution.mode() - labels) <= HIT
+    hits = jnp.all(hits.reshape(*counts.shape, -1), axis=-1)
+    return Stats(
+        nll=-total(distribution.log_prob(labels)),
+        correct=jnp.sum(hits & counts).astype(jnp.float32),
+        num_steps=counts.sum().astype(jnp.float32),
+        parts={name: total(values) for name, values in parts.items()},
+    )
 
 
 def learning_rate_schedule(config: TrainConfig) -> optax.Schedule:
@@ -166,11 +209,8 @@ def bc_loss(
         rngs={"dropout": key_dropout},
     )
     real = jnp.arange(len(trajectory.obs)) < trajectory.length
-    nll = -jnp.sum(jnp.where(real, distribution.log_prob(trajectory.labels), 0.0))
-    hits = jnp.abs(distribution.mode() - trajectory.labels) <= HIT
-    hits = jnp.all(hits.reshape(len(real), -1), axis=1)
-    correct = jnp.sum(hits & real).astype(jnp.float32)
-    return nll, Stats(nll, correct, trajectory.length.astype(jnp.float32))
+    stats = stats_of(distribution, trajectory.labels, real)
+    return stats.nll, stats
 
 
 def batch_loss(
@@ -178,24 +218,45 @@ def batch_loss(
     keys: Key[Array, "B"],
     part: Trajectory,
     deterministic: bool,
-    network: GoalTransformer,
+    learned: Learned,
+    network: NetworkConfig,
     obs_noise: float,
 ) -> tuple[Float[Array, ""], Stats]:
     """The loss and statistics of several trajectories, summed."""
 
     def one(key: PRNGKeyArray, trajectory: Trajectory) -> tuple[Array, Stats]:
-        return bc_loss(params, key, network, trajectory, deterministic, obs_noise)
+        return learned.loss(params, key, network, trajectory, deterministic, obs_noise)
 
-    nll, stats = jax.vmap(one)(keys, part)
-    return nll.sum(), jax.tree.map(jnp.sum, stats)
+    loss, stats = jax.vmap(one)(keys, part)
+    return loss.sum(), jax.tree.map(jnp.sum, stats)
 
 
-def initial_params(key: PRNGKeyArray, network: GoalTransformer, dataset: Dataset) -> Any:
-    """Random weights of a network for the trajectories of a dataset."""
-    first = jax.tree.map(jnp.asarray, dataset.gather(np.array([0]), np.array([1]), 1))
-    one = jax.tree.map(lambda leaf: leaf[0], first)
-    prompt = single_goal(one.outcomes[0], network.config.max_prompt_length)
-    return network.init(key, prompt, one.obs, one.actions)
+def initial_params(key: PRNGKeyArray, config: TransformerConfig) -> Any:
+    """Random weights of a multi-goal policy."""
+    prompt = single_goal(jnp.zeros(config.goal_dim), config.max_prompt_length)
+    return GoalTransformer(config).init(key, prompt, *config.blank_episode())
+
+
+def _prompted_loss(
+    params: Any, key: PRNGKeyArray, config: TransformerConfig, *rest: Any
+) -> tuple[Float[Array, ""], Stats]:
+    return bc_loss(params, key, GoalTransformer(config), *rest)
+
+
+def transformer_told(config: TransformerConfig) -> str:
+    """The sizes of a Transformer in words."""
+    return f"{config.num_layers} layers, width {config.embed_dim}, {config.num_heads} head(s)"
+
+
+def _facts(config: TransformerConfig) -> dict[str, str]:
+    order = "with" if config.prompt_order else "without"
+    return {
+        "network": transformer_told(config),
+        "prompts": f"up to {config.max_prompt_length} goals, {order} an order embedding",
+    }
+
+
+PROMPTED = Learned(config=TransformerConfig, init=initial_params, loss=_prompted_loss, facts=_facts)
 
 
 def _flatten(params: Any) -> Array:
@@ -210,7 +271,12 @@ class _Accumulator:
     """
 
     def __init__(
-        self, mesh: Mesh, loss: Callable, shapes: Any, unravel: Callable[[Any], Any]
+        self,
+        mesh: Mesh,
+        loss: Callable,
+        shapes: Any,
+        stats_shapes: Stats,
+        unravel: Callable[[Any], Any],
     ) -> None:
         self.mesh = mesh
 
@@ -220,8 +286,7 @@ class _Accumulator:
 
         def zeros() -> Any:
             num = mesh.devices.size
-            grads = jax.tree.map(lambda leaf: jnp.zeros((num, *leaf.shape)), shapes)
-            return grads, Stats(*jnp.zeros((3, num)))
+            return jax.tree.map(lambda leaf: jnp.zeros((num, *leaf.shape)), (shapes, stats_shapes))
 
         def pack(sums: Any) -> Any:
             return _flatten(sums[0])[None], sums[1]
@@ -247,11 +312,10 @@ def _make_update(
     @partial(jax.jit, donate_argnums=(0, 1))
     def update(params: Any, opt_state: Any, rows: list[Any]) -> tuple[Any, Any, dict[str, Array]]:
         flat, stats = jax.tree.map(lambda *of_devices: sum(of_devices)[0], *rows)
-        grads, weights = flat / stats.num_steps, _flatten(params)
+        grads, weights = flat / stats.divisor, _flatten(params)
         updates, opt_state = optimizer.update(grads, opt_state, weights)
         metrics = {
-            "loss": stats.nll / stats.num_steps,
-            "accuracy": stats.correct / stats.num_steps,
+            **stats.means,
             "grad_norm": optax.tree.norm(grads),
             "num_steps": stats.num_steps,
         }
@@ -277,7 +341,7 @@ class Trainer:
     """
 
     def __init__(
-        self, config: TrainConfig, network_config: TransformerConfig, dataset: Dataset, mesh: Mesh
+        self, config: TrainConfig, network_config: NetworkConfig, dataset: Dataset, mesh: Mesh
     ) -> None:
         check_settings(config)
         if config.part_size % mesh.devices.size:
@@ -293,17 +357,23 @@ class Trainer:
                 f"--obs-noise has no use where --encoder {network_config.encoder} rounds the codes and "
                 "counts of observations; leave it out"
             )
-        network = GoalTransformer(network_config)
+        learned = kind_of(network_config).load()
         self._key_init, key_steps, self._key_eval = jax.random.split(jax.random.key(config.seed), 3)
         self._dataset = dataset
-        self._initial_params = partial(initial_params, self._key_init, network, dataset)
+        self._initial_params = partial(learned.init, self._key_init, network_config)
         shapes = jax.eval_shape(self._initial_params)
         blank = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
         _, unravel = ravel_pytree(blank)
         self._flatten = jax.jit(_flatten)
         self._optimizer = make_optimizer(config, unravel)
-        loss = partial(batch_loss, network=network, obs_noise=config.obs_noise)
-        self._accumulator = _Accumulator(mesh, loss, shapes, unravel)
+        loss = partial(
+            batch_loss, learned=learned, network=network_config, obs_noise=config.obs_noise
+        )
+        first = dataset.gather(np.array([0]), np.array([1]), 1)
+        stats = jax.eval_shape(
+            partial(loss, deterministic=True), shapes, jax.random.split(self._key_init, 1), first
+        )[1]
+        self._accumulator = _Accumulator(mesh, loss, shapes, stats, unravel)
         self._update = _make_update(self._optimizer, unravel)
 
         @partial(jax.jit, static_argnums=2, out_shardings=spread(mesh))
@@ -349,7 +419,7 @@ class Trainer:
         rows = self._dataset if dataset is None else dataset
         stats = [self._part_stats(params, self._key_eval, rows.gather(*plan)) for plan in plans]
         total = jax.tree.map(lambda *leaves: float(sum(leaves)), *fetch(stats))
-        return {"loss": total.nll / total.num_steps, "accuracy": total.correct / total.num_steps}
+        return total.means
 
 
 def finite_metrics(step: int, metrics: Mapping[str, Any]) -> dict[str, Any]:

@@ -15,13 +15,14 @@ the causal mask alone), and all tokens pass the input LayerNorm (theirs: all but
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 from annotated_types import Ge, Gt, Le, MaxLen
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
@@ -42,8 +43,8 @@ Size = Annotated[int, Ge(1), Le(1_000_000)]
 
 
 @dataclass(frozen=True)
-class TransformerConfig:
-    """Sizes of the network. Defaults are Table 6 of the paper."""
+class NetworkConfig:
+    """What every network is told of its world, and how it reads observations and gives actions."""
 
     __pydantic_config__ = STRICT
 
@@ -61,6 +62,48 @@ class TransformerConfig:
     """How observations become tokens, one of ``settings.ENCODERS``."""
     head: str = "categorical"
     """The action distribution, one of ``distributions.HEADS``."""
+    obs_mean: tuple[Annotated[float, Ge(-1e18), Le(1e18)], ...] = ()
+    """Mean of every component of an observation in training, in the order of the flattened observation,
+    where observations are standardized (empty: they are not)."""
+    obs_std: tuple[Annotated[float, Gt(0), Le(1e18)], ...] = ()
+    """Standard deviation of every component, likewise."""
+    obs_layout: ObsLayout | None = None
+    """What the numbers of an observation are, for the encoders that use it."""
+
+    def standardized(self, obs: Shaped[Array, "..."]) -> Shaped[Array, "..."]:
+        """Observations ``[*batch, ...]`` as the encoder takes them."""
+        if not self.obs_mean:
+            return obs
+        mean, std = (
+            jnp.array(row).reshape(self.obs_shape) for row in (self.obs_mean, self.obs_std)
+        )
+        return jnp.clip((obs - mean) / std, -OBS_LIMIT, OBS_LIMIT)
+
+    def make_encoder(self, width: int) -> nn.Module:
+        """The module that turns observations into tokens of a width."""
+        make = ENCODERS.find(self.encoder).make
+        module: nn.Module = make(self.obs_shape, width, self.obs_layout)
+        return module
+
+    def action_numbers(self, actions: Array) -> Float[Array, "... A"]:
+        """Actions as numbers that a layer takes: one-hot where they are discrete."""
+        discrete = self.head == "categorical"
+        return jax.nn.one_hot(actions, self.action_dim) if discrete else actions
+
+    def blank_episode(self, num_steps: int = 1) -> tuple[Array, Array]:
+        """Observations and actions of the right shapes and dtypes, all zeros."""
+        discrete = self.head == "categorical"
+        actions = (num_steps,) if discrete else (num_steps, self.action_dim)
+        obs = jnp.zeros((num_steps, *self.obs_shape), self.obs_dtype)
+        return obs, jnp.zeros(actions, jnp.int32 if discrete else jnp.float32)
+
+
+@dataclass(frozen=True)
+class TransformerConfig(NetworkConfig):
+    """Sizes of the network. Defaults are Table 6 of the paper."""
+
+    __pydantic_config__ = STRICT
+
     max_prompt_length: NumGoals = 5
     """K, the number of prompt slots."""
     embed_dim: Width = 128
@@ -70,15 +113,8 @@ class TransformerConfig:
     """Rate on embeddings, attention weights and residual branches."""
     prompt_order: bool = True
     """Whether prompt slots carry a position embedding (the paper's network: False)."""
-    obs_mean: tuple[Annotated[float, Ge(-1e18), Le(1e18)], ...] = ()
-    """Mean of every component of an observation in training, in the order of the flattened observation,
-    where observations are standardized (empty: they are not)."""
-    obs_std: tuple[Annotated[float, Gt(0), Le(1e18)], ...] = ()
-    """Standard deviation of every component, likewise."""
     tokens_per_step: TokensPerStep = 2
     """An observation and an action as two tokens, or the last action and the observation as one."""
-    obs_layout: ObsLayout | None = None
-    """What the numbers of an observation are, for the encoders that use it."""
 
     def num_step_tokens(self, num_steps: int | Int[Array, ""]) -> Any:
         """The number of tokens of some steps, up to the last observation."""
@@ -89,6 +125,15 @@ def network_config(spec: EnvSpec, head: str | None = None, **sizes: Any) -> Tran
     """The network for a world, with Table 6's sizes unless given others.
 
     Raises:
+      UsageError: as ``world_side``.
+    """
+    return TransformerConfig(**world_side(spec, head, sizes.get("encoder", "linear")), **sizes)
+
+
+def world_side(spec: EnvSpec, head: str | None, encoder: str) -> dict[str, Any]:
+    """What a network's config says of its world, by the names of its fields (without ``encoder``).
+
+    Raises:
       UsageError: if there is no such head or encoder, the head is not one for the world's actions, or the
         encoder not one for its observations.
     """
@@ -96,18 +141,15 @@ def network_config(spec: EnvSpec, head: str | None = None, **sizes: Any) -> Tran
     head = head or known[0]
     if head not in known:
         raise nearest(head, known, f"head for {spec.name}")
-    encoder = sizes.get("encoder", "linear")
-    layout = _layout_for(ENCODERS.find(encoder), spec)
-    return TransformerConfig(
-        obs_shape=spec.obs.shape,
-        obs_dtype=spec.obs.dtype,
-        goal_dim=spec.goal_dim,
-        action_dim=spec.action_dim,
-        horizon=spec.horizon,
-        head=head,
-        obs_layout=layout,
-        **sizes,
-    )
+    return {
+        "obs_shape": spec.obs.shape,
+        "obs_dtype": spec.obs.dtype,
+        "goal_dim": spec.goal_dim,
+        "action_dim": spec.action_dim,
+        "horizon": spec.horizon,
+        "head": head,
+        "obs_layout": _layout_for(ENCODERS.find(encoder), spec),
+    }
 
 
 def _layout_for(encoder: Encoder, spec: EnvSpec) -> ObsLayout | None:
@@ -164,7 +206,7 @@ class Block(nn.Module):
         self.dropout = nn.Dropout(self.config.dropout)
 
     def __call__(
-        self, x: Float[Array, "S E"], rows: slice, attend: Attend, deterministic: bool
+        self, x: Float[Array, "S E"], rows: slice | np.ndarray, attend: Attend, deterministic: bool
     ) -> Float[Array, "R E"]:
         """Transform the tokens ``x[rows]``, which attend to keys and values of all of ``x``."""
         h = self.norm_attention(x)
@@ -218,8 +260,7 @@ class GoalTransformer(nn.Module):
         config = self.config
         small = nn.initializers.normal(0.02)
         self.embed_goal = nn.Dense(config.embed_dim)
-        encoder = ENCODERS.find(config.encoder)
-        self.embed_obs = encoder.make(config.obs_shape, config.embed_dim, config.obs_layout)
+        self.embed_obs = config.make_encoder(config.embed_dim)
         self.embed_action = nn.Dense(config.embed_dim)
         self.embed_time = self.param("embed_time", small, (config.horizon, config.embed_dim))
         if config.prompt_order:
@@ -250,29 +291,53 @@ class GoalTransformer(nn.Module):
         obs: Shaped[Array, "T ..."],
         actions: Array,
         deterministic: bool = True,
-    ) -> Float[Array, "T E"]:
-        """What the last layer reads at all T observations."""
-        num_steps = obs.shape[0]
-        num_slots = self.config.max_prompt_length
-        steps = self._step_tokens(obs, actions, self.embed_time[:num_steps])
-        x = self.norm_in(jnp.concatenate([self._prompt_tokens(prompt), steps]))
-        x = self.dropout(x, deterministic=deterministic)
+    ) -> Float[Array, "R E"]:
+        """What the last layer reads: R = T rows, one for each observation, if there are any blocks."""
+        num_slots, stride = self.config.max_prompt_length, self.config.tokens_per_step
+        steps = self._step_tokens(obs, actions, self.embed_time[: len(obs)])
+        x = jnp.concatenate([self._prompt_tokens(prompt), steps])
+        # Only observations are read out, so the last layer computes nothing else.
+        reads = slice(num_slots, None, stride)
+        return self._full_pass(
+            x, self._seen(prompt, len(steps)), range(len(x)), reads, deterministic
+        )
 
-        num_tokens = num_slots + len(steps)
-        seen = jnp.concatenate([prompt.mask, jnp.ones(len(steps), bool)])
-        positions = jnp.arange(num_tokens)
+    def _seen(self, prompt: Prompt, num_tokens: int) -> Bool[Array, "S"]:
+        """Which tokens of the prompt and of the steps after it there are."""
+        return jnp.concatenate([prompt.mask, jnp.ones(num_tokens, bool)])
+
+    def _full_pass(
+        self,
+        x: Float[Array, "N E"],
+        seen: Bool[Array, "S"],
+        at: Sequence[int] | np.ndarray,
+        reads: slice | np.ndarray,
+        deterministic: bool,
+    ) -> Float[Array, "R E"]:
+        """Run all tokens at once.
+
+        Args:
+          x: embeddings of the tokens. The first S of them can be attended to, the others only read.
+          seen: which of the first S there are.
+          at: positions of all tokens: each sees those of the first S up to its own.
+          reads: the tokens whose outputs are wanted.
+          deterministic: no dropout.
+        """
+        x = self.dropout(self.norm_in(x), deterministic=deterministic)
+        positions = jnp.arange(len(seen))
         drop = lambda weights: self.dropout(weights, deterministic=deterministic)  # noqa: E731
         for index, block in enumerate(self.blocks):
             last = index == self.config.num_layers - 1
-            # Only observations are read out, so the last layer computes nothing else.
-            rows = slice(num_slots, None, self.config.tokens_per_step) if last else slice(None)
-            row_positions = range(num_tokens)[rows]
+            rows = reads if last else slice(None)
+            row_positions = np.asarray(at)[rows]
 
-            def attend(query: Array, key: Array, value: Array, at: range = row_positions) -> Array:
+            def attend(
+                query: Array, key: Array, value: Array, at: np.ndarray = row_positions
+            ) -> Array:
                 mixed = []
                 for start in range(0, len(at), QUERY_BLOCK):
                     block_at = at[start : start + QUERY_BLOCK]
-                    end = block_at[-1] + 1  # later keys are hidden by causality
+                    end = max(block_at) + 1  # later keys are hidden by causality
                     visible = seen[None, :end] & (
                         positions[None, :end] <= jnp.asarray(block_at)[:, None]
                     )
@@ -285,6 +350,13 @@ class GoalTransformer(nn.Module):
 
     def prefill(self, prompt: Prompt, obs: Shaped[Array, "..."]) -> tuple[Distribution, KVCache]:
         """Read the prompt and the first observation; returns pi(a_1) and the cache."""
+        features, cache = self._first(prompt, obs)
+        return self._distribution(features), cache
+
+    def _first(
+        self, prompt: Prompt, obs: Shaped[Array, "..."]
+    ) -> tuple[Float[Array, "1 E"], KVCache]:
+        """Read the prompt and the first observation; returns the features at it and the cache."""
         config = self.config
         first = self._obs_token(obs[None], self.embed_time[:1])
         x = self.norm_in(jnp.concatenate([self._prompt_tokens(prompt), first]))
@@ -300,6 +372,13 @@ class GoalTransformer(nn.Module):
 
         The cache must have room for the tokens of one more step (``grow_cache``).
         """
+        features, cache = self._append(cache, action, obs)
+        return self._distribution(features), cache
+
+    def _append(
+        self, cache: KVCache, action: Array, obs: Shaped[Array, "..."]
+    ) -> tuple[Float[Array, "1 E"], KVCache]:
+        """Append (a_{t-1}, o_t); returns the features at o_t and the longer cache."""
         config, action = self.config, jnp.asarray(action)[None]
         if config.tokens_per_step == 1:
             time = jax.lax.dynamic_slice_in_dim(self.embed_time, cache.step, 1)
@@ -312,9 +391,13 @@ class GoalTransformer(nn.Module):
         return self._extend(self.norm_in(tokens), cache, at=at)
 
     def _extend(
-        self, x: Float[Array, "R E"], cache: KVCache, at: int | Int[Array, ""]
-    ) -> tuple[Distribution, KVCache]:
-        """Run new tokens, the first of them at position ``at``, against the cache."""
+        self, x: Float[Array, "R E"], cache: KVCache, at: int | Int[Array, ""], keeps: bool = True
+    ) -> tuple[Float[Array, "1 E"], KVCache]:
+        """Run new tokens, the first of them at position ``at``, against the cache.
+
+        Returns the features of the last one, and the cache with all of them. Without ``keeps`` they only
+        read what is there up to their position, and the cache stays as it is.
+        """
         num_new = len(x)
         capacity = cache.keys[0].shape[1]
         num_steps_tokens = capacity - self.config.max_prompt_length
@@ -329,39 +412,39 @@ class GoalTransformer(nn.Module):
             def attend(
                 query: Array, key: Array, value: Array, index: int = index, visible: Array = visible
             ) -> Array:
-                key, value = (
-                    jax.lax.dynamic_update_slice_in_dim(old, new.swapaxes(0, 1), at, axis=1)
-                    for old, new in ((cache.keys[index], key), (cache.values[index], value))
-                )
+                old = cache.keys[index], cache.values[index]
+                if keeps:
+                    key, value = (
+                        jax.lax.dynamic_update_slice_in_dim(rows, new.swapaxes(0, 1), at, axis=1)
+                        for rows, new in zip(old, (key, value), strict=True)
+                    )
+                else:
+                    key, value = old
                 keys.append(key)
                 values.append(value)
                 return _attention_by_row(query, key, value, visible)
 
             x = block(x, slice(first_row, None), attend, True)
         grown = KVCache(tuple(keys), tuple(values), cache.prompt_mask, cache.step + 1)
-        return jax.tree.map(lambda leaf: leaf[-1], self.read_out(self.norm_out(x))), grown
+        return self.norm_out(x), grown if keeps else cache
+
+    def _distribution(self, features: Float[Array, "1 E"]) -> Distribution:
+        """The action distribution at one observation."""
+        found: Distribution = jax.tree.map(lambda leaf: leaf[-1], self.read_out(features))
+        return found
 
     def _prompt_tokens(self, prompt: Prompt) -> Float[Array, "P E"]:
         tokens = self.embed_goal(prompt.goals)
         return tokens + self.embed_slot if self.config.prompt_order else tokens
 
     def _obs_token(self, obs: Shaped[Array, "T ..."], time: Array) -> Float[Array, "T E"]:
-        config = self.config
-        if config.obs_mean:
-            mean, std = (
-                jnp.array(row).reshape(config.obs_shape)
-                for row in (config.obs_mean, config.obs_std)
-            )
-            obs = jnp.clip((obs - mean) / std, -OBS_LIMIT, OBS_LIMIT)
-        return self.embed_obs(obs) + time
+        return self.embed_obs(self.config.standardized(obs)) + time
 
     def _action_token(self, actions: Array, time: Array) -> Float[Array, "T E"]:
         return self._embedded(actions) + time
 
     def _embedded(self, actions: Array) -> Float[Array, "T E"]:
-        if self.config.head == "categorical":
-            actions = jax.nn.one_hot(actions, self.config.action_dim)
-        return self.embed_action(actions)
+        return self.embed_action(self.config.action_numbers(actions))
 
     def _step_tokens(
         self, obs: Shaped[Array, "T ..."], actions: Array, time: Float[Array, "T E"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -143,6 +144,10 @@ def test_sizes_are_those_of_the_spec(name):
     goal = ((spec.goal_dim,), jnp.float32)
     assert shapes(jax.eval_shape(env.sample_goal, key)) == goal
     assert shapes(jax.eval_shape(env.task_goal, task)) == goal
+    assert env.goal_set.shape[1:] == (spec.goal_dim,)
+    assert env.goal_set.dtype == np.float32
+    with suppress(NotAvailableError):
+        assert shapes(jax.eval_shape(lambda state: env.expert_goal(state, 10), state)) == goal
     assert shapes(jax.eval_shape(env.optimal_return, task)) == scalar
     fingerprint = jax.eval_shape(env.fingerprint, task)
     assert fingerprint.ndim == 1

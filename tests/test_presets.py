@@ -9,7 +9,7 @@ import pytest
 import envs
 from envs.errors import UsageError
 from envs.registry import WORLDS
-from experiments.store.paper import paper_value
+from experiments.store.paper import METHODS_IN, paper_final, paper_rows, paper_value
 from experiments.store.settings import pretrain_preset
 from mgpo_jax.methods import METHODS
 
@@ -63,3 +63,13 @@ def test_a_world_has_the_numbers_of_the_paper_under_its_home():
     assert paper_value("table2", "kitchen-mjx", "ucb") == paper_value("table2", "kitchen", "ucb")
     assert paper_value("table2", "kitchen", "ucb") == "0.63 ± 0.02"
     assert paper_value("table2", "nowhere", "ucb") == ""
+
+
+def test_tables_of_the_paper_agree():
+    """A method in a world has one final return, in whichever table it stands."""
+    for world in ("maze15", "maze30", "gridworld", "kitchen", "crafter", "crafter-symbolic"):
+        for method in {name for table in METHODS_IN for name in paper_rows(table, world)}:
+            values = {paper_value(table, world, method) for table in METHODS_IN} - {""}
+            assert values == {paper_final(world, method)}
+    assert paper_final("kitchen-stock", "ptgm") == "0.25 ± 0.03"
+    assert paper_final("maze15", "reinforce") == "-2.59 ± 0.24"

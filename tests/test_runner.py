@@ -12,7 +12,7 @@ import pytest
 
 from envs.base import ArraySpec, Box, Engine, Environment, EnvSpec, TimeStep
 from envs.episodes import replay
-from envs.errors import UsageError
+from envs.errors import DataError, UsageError
 from envs.gridworld.env import GridWorld
 from envs.maze.env import MazeRunner
 from envs.registry import Judgement
@@ -506,6 +506,24 @@ class Fragile(Wrapper):
         truncated = (timestep.truncated | broken) & ~timestep.terminated
         failed = broken & ~timestep.terminated
         return (time + 1, inner), timestep._replace(truncated=truncated, failed=failed)
+
+
+def make_diverging(setting, params, hyper):
+    """Keeps the prompt (g^M), and learns NaN in the second round."""
+    base = GCBC.adapter(setting, params, hyper)
+    return Adapter(
+        init=lambda key, task_goal: (base.init(key, task_goal), jnp.ones(())),
+        ask=lambda key, state: (base.ask(key, state[0])[0], state),
+        agent=lambda state, choice: base.agent(state[0], choice),
+        tell=lambda key, state, choice, episodes: (state[0], jnp.sqrt(state[1] - 1) / state[1]),
+        best=lambda state: base.best(state[0]),
+    )
+
+
+def test_a_search_that_diverges_ends_with_one_line(tasks):
+    method = Method(name="diverging", make=make_diverging)
+    with pytest.raises(DataError, match=r"task 0 with seed number 0 has diverged.* after 2 rounds"):
+        sweep(MAZE, untrained(MAZE), tasks, method, [NoHyper()], episodes=4, eval_every=2)
 
 
 def test_broken_worlds_are_counted(tasks):

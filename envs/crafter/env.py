@@ -22,10 +22,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from craftax.craftax_classic.constants import Achievement
 from craftax.craftax_classic.envs.craftax_state import EnvState
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 
 from envs.base import ArraySpec, Discrete, Environment, EnvSpec, TimeStep
+from envs.crafter.planning import TIERS
 from envs.crafter.rules import SIDE, advance, new_world
 from envs.crafter.tiles import PIXELS, agent_picture
 from envs.crafter.view import (
@@ -118,6 +120,19 @@ class Crafter(Environment):
         """An achievement, in no known place."""
         goal = jax.random.randint(key, (), 0, NUM_ACHIEVEMENTS)
         return self._without_place(jax.nn.one_hot(goal, NUM_ACHIEVEMENTS))
+
+    @property
+    def goal_set(self) -> np.ndarray:
+        """The achievements, in no known place."""
+        places = NUM_PLACE * self.places
+        return np.pad(np.eye(NUM_ACHIEVEMENTS, dtype=np.float32), ((0, 0), (0, places)))
+
+    def expert_goal(self, state: CrafterState, num_steps: int) -> Float[Array, "G"]:
+        """What usually comes first of the achievements that are not unlocked yet, in no known place."""
+        del num_steps
+        place = jnp.asarray([TIERS[achievement] for achievement in Achievement])
+        first = jnp.argmin(jnp.where(state.world.achievements, jnp.inf, place))
+        return self._without_place(jax.nn.one_hot(first, NUM_ACHIEVEMENTS))
 
     def task_goal(self, task: CrafterTask) -> Float[Array, "G"]:
         """All achievements, in every world."""

@@ -88,6 +88,17 @@ class GridWorld(Environment):
     def sample_goal(self, key: PRNGKeyArray) -> Float[Array, "G"]:
         return jax.nn.one_hot(jax.random.randint(key, (), 0, NUM_OBJECTS), NUM_OBJECTS)
 
+    @property
+    def goal_set(self) -> np.ndarray:
+        """The objects."""
+        return np.eye(NUM_OBJECTS, dtype=np.float32)
+
+    def expert_goal(self, state: GridState, num_steps: int) -> Float[Array, "G"]:
+        """The next object of the order, or the last one."""
+        del num_steps
+        last = jnp.sum(state.task.order != NONE) - 1
+        return jax.nn.one_hot(state.task.order[jnp.minimum(state.num_solved, last)], NUM_OBJECTS)
+
     def task_goal(self, task: GridTask) -> Float[Array, "G"]:
         """The set of objects as a multi-hot vector; their order stays hidden."""
         return jax.nn.one_hot(task.order, NUM_OBJECTS).sum(axis=0)

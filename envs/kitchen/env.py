@@ -148,6 +148,17 @@ class Kitchen(Environment):
     def sample_goal(self, key: PRNGKeyArray) -> Float[Array, "G"]:
         return jax.nn.one_hot(jax.random.randint(key, (), 0, NUM_SUBTASKS), NUM_SUBTASKS)
 
+    @property
+    def goal_set(self) -> np.ndarray:
+        """The subtasks."""
+        return np.eye(NUM_SUBTASKS, dtype=np.float32)
+
+    def expert_goal(self, state: KitchenState, num_steps: int) -> Float[Array, "G"]:
+        """The next subtask of the order, or the last one."""
+        del num_steps
+        last = jnp.sum(state.task.order != NONE) - 1
+        return jax.nn.one_hot(state.task.order[jnp.minimum(state.num_solved, last)], NUM_SUBTASKS)
+
     def task_goal(self, task: Task) -> Float[Array, "G"]:
         """The set of subtasks as a multi-hot vector; their order stays hidden."""
         return jax.nn.one_hot(task.order, NUM_SUBTASKS).sum(axis=0)

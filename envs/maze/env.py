@@ -82,6 +82,25 @@ class MazeRunner(Environment):
         cell = jax.random.randint(key, (2,), 1, self.side - 1)
         return self.goal_at(cell)
 
+    @property
+    def goal_set(self) -> np.ndarray:
+        """All cells inside of the border, walls or not: a maze is not known beforehand."""
+        inner = self.side - 2
+        cells = 1 + np.stack(np.divmod(np.arange(inner**2), inner), axis=1)
+        return (cells / self.side).astype(np.float32)
+
+    def expert_goal(self, state: MazeState, num_steps: int) -> Float[Array, "2"]:
+        """The cell on a shortest path that many steps ahead, or the goal."""
+        steps_left = distances(state.task.maze == 0, state.task.goal)
+
+        def walk(index: Array, cell: Array) -> Array:
+            del index
+            around = cell + jnp.asarray(MOVES)
+            left = steps_left[around[:, 0], around[:, 1]]
+            return around[jnp.argmin(jnp.where(left >= 0, left, steps_left.size))]
+
+        return self.goal_at(jax.lax.fori_loop(0, num_steps, walk, state.position))
+
     def goal_at(self, position: Int[Array, "2"]) -> Float[Array, "2"]:
         """A cell as a goal: row and column in units of the side."""
         return position.astype(jnp.float32) / self.side

@@ -22,7 +22,7 @@ from experiments.pages.knowledge import knowledge_of
 from experiments.pages.packing import packed, smallest
 from experiments.pages.worlds import page_of, tasks_in_page
 from experiments.store.layout import META
-from experiments.store.paper import paper_value
+from experiments.store.paper import paper_final
 from experiments.store.provenance import read_meta
 from experiments.store.results import Results, load_results
 from experiments.store.rows import Row, read_row
@@ -128,7 +128,7 @@ def _facts(results: Results, row: Row) -> list[tuple[str, str]]:
     shares = [
         f"p{k} {PartShare(*pair)}" for k, pair in enumerate(summary.get("part_shares") or (), 1)
     ]
-    paper = paper_value("table2", summary["env"], method_of(summary)) if row.like_the_paper else ""
+    paper = paper_final(summary["env"], method_of(summary)) if row.like_the_paper else ""
     return [
         ("world", summary["env"]),
         ("method", method_of(summary)),

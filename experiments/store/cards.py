@@ -19,6 +19,7 @@ from experiments.store.provenance import read_meta
 from experiments.store.settings import INIT, PretrainConfig, pretraining_from
 from mgpo_jax.dataset import variant_counts
 from mgpo_jax.files import new_folder, write_text
+from mgpo_jax.kinds import MULTI_GOAL, Kind, kind_of
 from mgpo_jax.policy import LoadedPolicy, check_fits
 from mgpo_jax.policy_files import CONFIG, WEIGHTS, read_policy
 from mgpo_jax.released import released_folder
@@ -26,17 +27,15 @@ from mgpo_jax.tasks import benchmark_tasks, save_tasks
 from mgpo_jax.training import HIT
 
 FOLLOWED = "eval/followed_return"
-CARD = """# Multi-goal Transformer for {env}
+CARD = """# {title} for {env}
 
 | | |
 | --- | --- |
-| network | {num_layers} layers, width {embed_dim}, {num_heads} head(s), {num_weights:,} weights |
-| prompts | up to {max_prompt_length} goals, {order} |
+{facts}
 | data | {trajectories:,} demonstrations of {demonstrator}, seed {data_seed}{variants} |{begun}
 | training | {steps:,} steps of {batch_size} trajectories, {optimizer}, {cpu_minutes:.0f} CPU-minutes |
 | validation loss | {val_loss:.4f} nats an action, {correct} {val_accuracy:.4f} |
-| {acting} return of the prompt (g^M) | {initial:.3f} on {eval_tasks} tasks of the training's own |
-| {acting} return of a demonstration's prompt | {followed} |
+| {acting} return of {watched} | {initial:.3f} on {eval_tasks} tasks of the training's own |{followed}
 
 Made by
 
@@ -44,8 +43,8 @@ Made by
 
 ![loss and {acting} returns while training](training.png)
 
-Files: `weights.npz`, `config.json` (network, SHA-256 of the weights, all settings), `tasks.npz` (the
-test tasks, in no dataset), `metrics.jsonl`. Results on them are in `results/` and the README.
+Files: `weights.npz`, `config.json` (network, SHA-256 of the weights, all settings), {tasks}`metrics.jsonl`.
+Results {where} are in `results/` and the README.
 """
 
 
@@ -70,7 +69,12 @@ class Finished(NamedTuple):
     @property
     def released(self) -> Path:
         """Where the world's released policy lies."""
-        return released_folder(self.world)
+        return released_folder(self.world, self.kind.name)
+
+    @property
+    def kind(self) -> Kind:
+        """The kind of its network."""
+        return kind_of(self.policy.config)
 
 
 def read_run(source: Path, env: str | None = None) -> Finished:
@@ -117,16 +121,24 @@ def cpu_minutes(rows: Sequence[dict[str, Any]]) -> float:
 
 def card(run: Finished) -> str:
     """The text that describes a released policy."""
-    network, settings, last, env = run.policy.config, run.settings, run.rows[-1], run.world.make()
-    order = "with" if network.prompt_order else "without"
+    settings, last, env = run.settings, run.rows[-1], run.world.make()
+    num_weights = sum(leaf.size for leaf in jax.tree.leaves(run.policy.params))
+    facts = run.kind.load().facts(run.policy.config)
+    facts = {**facts, "network": f"{facts['network']}, {num_weights:,} weights"}
+    acting = "greedy" if run.world.judged.mode == "greedy" else "sampled"
+    followed = (
+        f"\n| {acting} return of a demonstration's prompt | {last[FOLLOWED]:.3f} on the same tasks |"
+        if FOLLOWED in last
+        else ""
+    )
+    tested = run.kind.name == MULTI_GOAL
     return CARD.format(
+        title=run.kind.title,
         env=settings.env,
-        num_layers=network.num_layers,
-        embed_dim=network.embed_dim,
-        num_heads=network.num_heads,
-        num_weights=sum(leaf.size for leaf in jax.tree.leaves(run.policy.params)),
-        max_prompt_length=network.max_prompt_length,
-        order=f"{order} an order embedding",
+        facts="\n".join(f"| {name} | {text} |" for name, text in facts.items()),
+        watched=run.kind.watched,
+        tasks="`tasks.npz` (the\ntest tasks, in no dataset), " if tested else "",
+        where="on them" if tested else "of the methods that use it",
         trajectories=settings.data.trajectories,
         demonstrator=find_demonstrator(run.world, env, settings.data.demonstrator)[0],
         data_seed=settings.data.data_seed,
@@ -138,9 +150,9 @@ def card(run: Finished) -> str:
         cpu_minutes=cpu_minutes(run.rows),
         val_loss=last["val/loss"],
         val_accuracy=last["val/accuracy"],
-        acting="greedy" if run.world.judged.mode == "greedy" else "sampled",
+        acting=acting,
         initial=last["eval/initial_return"],
-        followed=f"{last[FOLLOWED]:.3f} on the same tasks" if FOLLOWED in last else "-",
+        followed=followed,
         correct="accuracy" if env.spec.discrete else f"share within {HIT} in all dimensions",
         eval_tasks=settings.eval_tasks,
         command=printable(run.command),
@@ -185,11 +197,12 @@ def _origin(place: Path, made: Mapping[str, Any]) -> str:
 
 def release(run: Finished, folder: Path) -> None:
     """Write the released form of a run to a new folder, which appears when all of it is there."""
-    tasks = benchmark_tasks(run.world.make(), run.world.num_test_tasks)
     with new_folder(folder) as place:
         for name in (WEIGHTS, CONFIG):
             shutil.copy(run.source / "policy" / name, place / name)
         shutil.copy(run.source / METRICS, place)
         training_curve(run.rows).savefig(place / "training.png")
-        save_tasks(place / "tasks.npz", tasks)
+        if run.kind.name == MULTI_GOAL:
+            tasks = benchmark_tasks(run.world.make(), run.world.num_test_tasks)
+            save_tasks(place / "tasks.npz", tasks)
         write_text(place / "README.md", card(run))

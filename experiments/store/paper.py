@@ -24,6 +24,16 @@ def paper_rows(table: str, world: str) -> dict[str, Any]:
     return _numbers().get(table, {}).get(world, {})
 
 
+METHODS_IN = ("table2", "table1", "table8")
+"""The tables with a row for each method, whose numbers agree where two of them have a method."""
+
+
+def paper_final(world: str, method: str) -> str:
+    """The final return of a method in a world as the paper prints it; empty if it has none."""
+    found = (paper_value(table, world, method) for table in METHODS_IN)
+    return next(filter(None, found), "")
+
+
 def paper_value(table: str, world: str, row: str) -> str:
     """One number as the paper prints it; empty if it has none.
 

@@ -10,6 +10,7 @@ from experiments.store.layout import META
 from experiments.store.provenance import read_meta
 from experiments.store.results import Results
 from experiments.store.summary import ADAPT_AGAIN
+from mgpo_jax.methods import policy_kind
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.policy_files import CONFIG, load_policy
 from mgpo_jax.released import released_folder
@@ -36,7 +37,7 @@ def load_policy_of(results: Results, world: World, override: Path | None = None)
     faults: list[DataError] = []
     for place in there:
         try:
-            policy = load_policy(world, place)
+            policy = load_policy(world, place, policy_kind(results.method))
             check_weights(results, policy, f"{GIVE}, or {ADAPT_AGAIN}")
             return policy
         except DataError as error:  # the policy may lie at the next place
@@ -49,7 +50,7 @@ def places_of_policy(results: Results) -> list[Path]:
     they were made, or where that is from here."""
     policy, folder = results.config.get("policy"), results.folder
     if not policy:
-        return [released_folder(results.world)]
+        return [released_folder(results.world, policy_kind(results.method))]
     noted = [] if folder is None else read_meta(folder / META, ADAPT_AGAIN).policy_places
     return list(dict.fromkeys([*(Path(folder or "", place) for place in noted), Path(policy)]))
 

@@ -17,7 +17,7 @@ import numpy as np
 from envs.errors import DataError
 from envs.registry import WORLDS, World
 from experiments.store.layout import ARRAYS, CONFIG, SUMMARY, TASKS
-from experiments.store.paper import paper_value
+from experiments.store.paper import paper_final
 from experiments.store.settings import AdaptConfig
 from experiments.store.statistics import (
     Interval,
@@ -35,7 +35,7 @@ from experiments.store.summary import (
     read_summary,
 )
 from experiments.store.tables import number, shortened, table
-from mgpo_jax.methods import METHODS
+from mgpo_jax.methods import METHODS, policy_kind
 from mgpo_jax.released import released_folder
 from mgpo_jax.schema import ArrayField, array_names, read_arrays, read_document
 
@@ -139,15 +139,16 @@ def changed_settings(
         name: config[name] for name in SHOWN if config.get(name, fields[name]) != fields[name]
     }
     sha256 = summary.get("policy_sha256")
-    if "policy" not in changed and sha256 not in (None, _released_sha256(world, sha256)):
+    released = _released_sha256(world, policy_kind(method_of(summary)), sha256)
+    if "policy" not in changed and sha256 not in (None, released):
         changed["policy"] = sha256[:12] if sha256 else ""
     changed |= _changed_hyper(config, method_of(summary), world)
     return {shortened(name): _told(value) for name, value in changed.items()}
 
 
-def _released_sha256(world: World | None, default: str | None) -> str | None:
-    """The hash of a world's released policy; the default where there is none."""
-    place = released_folder(world) / CONFIG if world else None
+def _released_sha256(world: World | None, kind: str, default: str | None) -> str | None:
+    """The hash of a world's released network of a kind; the default where there is none."""
+    place = released_folder(world, kind) / CONFIG if world else None
     if place is None or not place.is_file():
         return default
     return json.loads(place.read_text())["sha256"]
@@ -258,7 +259,7 @@ def _cells(row: Row) -> list[str]:
         number(summary["regret"]),
         number(summary["regret_after_40"]),
         _share(summary["solved_optimally"], summary.get("unsolvable_tasks", 0)),
-        paper_value("table2", env, method) if row.like_the_paper else "",
+        paper_final(env, method) if row.like_the_paper else "",
     ]
 
 

@@ -21,6 +21,7 @@ import envs
 from envs.errors import DataError, UsageError, nearest, shown
 from experiments.runtime import Common
 from experiments.store.layout import CONFIG
+from mgpo_jax.kinds import KINDS, MULTI_GOAL
 from mgpo_jax.methods import NoHyper
 from mgpo_jax.schema import STRICT, Json, Sha256, read_document
 from mgpo_jax.settings import (
@@ -101,6 +102,8 @@ class PretrainConfig(Common):
 
     env: Name = DEFAULT_WORLD
     """The world, by name or as module:attribute (``python -m experiments.list`` shows the names)."""
+    method: Name = MULTI_GOAL
+    """The kind of network: mgpo follows prompts, ptgm and spirl are the low levels of those methods."""
     preset: Name = "fast"
     """Where the defaults below come from: fast, paper or smoke."""
     data: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
@@ -139,7 +142,7 @@ class PretrainConfig(Common):
     save_every: Count = 500
     """Steps between checkpoints."""
     out: Path | None = None
-    """Run folder (default: runs/pretrain/ENV/PRESET-seedSEED)."""
+    """Run folder (default: runs/pretrain/ENV/PRESET-seedSEED, with the method before the preset)."""
     resume: bool = False
     """Continue an interrupted run from its newest checkpoint, bit for bit."""
     tb: bool = False
@@ -149,7 +152,8 @@ class PretrainConfig(Common):
 
     @property
     def folder(self) -> Path:
-        name = f"{self.preset}-seed{self.train.seed}"
+        method = "" if self.method == MULTI_GOAL else f"{file_name(self.method)}-"
+        name = f"{method}{self.preset}-seed{self.train.seed}"
         return self.out or RUNS / "pretrain" / file_name(self.env) / name
 
 
@@ -205,16 +209,17 @@ def with_settings(config: PretrainConfig, changes: Mapping[str, Any]) -> Pretrai
     return replace(config, data=data, train=train, **groups[""])
 
 
-def pretrain_preset(env: str, preset: str) -> PretrainConfig:
-    """The default settings for a world: the general ones, then those of its record."""
-    world = envs.find(env)
+def pretrain_preset(env: str, preset: str, method: str = MULTI_GOAL) -> PretrainConfig:
+    """The default settings: the general ones, those of the world's record and of the kind of network."""
+    world, kind = envs.find(env), KINDS.find(method)
     if preset not in PRESETS:
         raise nearest(preset, PRESETS, "preset")
-    config = PretrainConfig(env=env, preset=preset)
+    config = PretrainConfig(env=env, preset=preset, method=method)
     own = world.presets.get(preset, {})
     smoke = preset == "smoke"
     if smoke or not own:  # it starts from the world's fast one
         config = with_settings(config, world.presets.get("fast", {}))
+    config = with_settings(config, kind.preset)
     config = with_settings(config, PRESETS[preset])
     if smoke:  # few padded lengths, so that little is compiled
         config = with_settings(config, {"bucket": 8 * config.train.bucket})
@@ -228,7 +233,7 @@ def pretrain_default(config: PretrainConfig, flags: Iterable[str] = ()) -> Pretr
       UsageError: if there is no such world, preset or policy.
       DataError: if the config of the policy is damaged, or that of a run that is resumed.
     """
-    default = pretrain_preset(config.env, config.preset)
+    default = pretrain_preset(config.env, config.preset, config.method)
     if config.init is None:
         return default
     if goes_on(config):

@@ -92,6 +92,57 @@ class CarefulPpoHyper(PpoHyper):
     max_kl: Positive | None = 0.02
 
 
+@dataclass(frozen=True)
+class PtgmHyper:
+    """Hyper-parameters of PTGM's high level. Values in brackets are those of Table 10."""
+
+    learning_rate: Rate = 1e-3
+    """Of Adam [1e-3]."""
+    batch_size: Annotated[int, Ge(1), Le(65_536)] = static(64)
+    """Transitions in an update [64]."""
+    discount: Share = 0.95
+    """Discount factor of a decision [0.95]."""
+    epsilon: Share = 0.1
+    """How often the high level takes a random goal [0.1]."""
+    kl: NotNegative = 0.5
+    """Weight of the divergence from the goal prior in the reward of a decision [0.5]."""
+    target_interval: Annotated[int, Ge(1), Le(1_000_000)] = 10
+    """Updates after which the target network is replaced [10]."""
+    sees_goal: bool = static(False)
+    """Whether the high level sees the task goal g^M; the paper does not say."""
+    reads: Literal["observation", "history"] = static("observation")
+    """What it sees of the episode: the embedded observation, or the low level's output at it, which knows
+    the history."""
+
+
+@dataclass(frozen=True)
+class PtgmGoalHyper(PtgmHyper):
+    """PTGM whose high level sees the task goal."""
+
+    sees_goal: bool = static(True)
+
+
+@dataclass(frozen=True)
+class SpirlHyper:
+    """Hyper-parameters of SPiRL's high level. Values in brackets are those of Table 9."""
+
+    learning_rate: Rate = 1e-3
+    """Of Adam, for actor, critics and alpha [1e-3]."""
+    batch_size: Annotated[int, Ge(1), Le(65_536)] = static(256)
+    """Transitions in an update [256]."""
+    discount: Share = 0.95
+    """Discount factor of a decision [0.95]."""
+    target_interval: Annotated[int, Ge(1), Le(1_000_000)] = 10
+    """Updates after which the target critics are replaced [10]."""
+    target_divergence: NotNegative = 1.0
+    """Nats that the policy's divergence from the prior is to settle at (1 in mazes and 5 in the kitchen in
+    SPiRL's code; the paper does not say)."""
+    alpha: Positive = 1.0
+    """Weight of the divergence at the start; it is learned."""
+    warmup_episodes: Annotated[int, Ge(0), Le(100_000)] = 10
+    """Episodes before the first update. They count, and the prior plays them."""
+
+
 _HERE = "mgpo_jax.baselines.finetune"
 
 REINFORCE = Method(
@@ -125,4 +176,67 @@ PPO_CAREFUL = Method(
     make=f"{_HERE}:make_ppo",
     check=f"{_HERE}:check_finetune",
     hyper=CarefulPpoHyper,
+)
+
+
+_PTGM = "mgpo_jax.baselines.ptgm"
+
+PTGM = Method(
+    name="ptgm",
+    title="PTGM",
+    summary="DQN chooses goals for a commanded low level (Table 1), without seeing the task goal",
+    make=f"{_PTGM}:make_ptgm",
+    check=f"{_PTGM}:check_ptgm",
+    hyper=PtgmHyper,
+    policy="ptgm",
+)
+PTGM_GOAL = Method(
+    name="ptgm-goal",
+    title="PTGM (sees the task goal)",
+    summary="PTGM whose high level sees the task goal g^M",
+    make=f"{_PTGM}:make_ptgm",
+    check=f"{_PTGM}:check_ptgm",
+    hyper=PtgmGoalHyper,
+    policy="ptgm",
+)
+PTGM_RANDOM = Method(
+    name="ptgm-random",
+    title="PTGM's low level, random goals",
+    summary="reference of PTGM: any goal with the same probability",
+    make=f"{_PTGM}:make_random",
+    policy="ptgm",
+)
+PTGM_PRIOR = Method(
+    name="ptgm-prior",
+    title="PTGM's low level, goals of the prior",
+    summary="reference of PTGM: goals drawn from the prior",
+    make=f"{_PTGM}:make_prior",
+    policy="ptgm",
+)
+PTGM_ORACLE = Method(
+    name="ptgm-oracle",
+    title="PTGM's low level, an expert's goals",
+    summary="reference of PTGM: the goals that an expert tells who knows the task",
+    make=f"{_PTGM}:make_oracle",
+    check=f"{_PTGM}:check_oracle",
+    policy="ptgm",
+)
+
+_SPIRL = "mgpo_jax.baselines.spirl"
+
+SPIRL = Method(
+    name="spirl",
+    title="SPiRL",
+    summary="soft actor-critic over pre-trained skills, near their prior (Table 1)",
+    make=f"{_SPIRL}:make_spirl",
+    check=f"{_SPIRL}:check_spirl",
+    hyper=SpirlHyper,
+    policy="spirl",
+)
+SPIRL_PRIOR = Method(
+    name="spirl-prior",
+    title="SPiRL's skills, drawn from the prior",
+    summary="reference of SPiRL: skills drawn from the prior in every episode",
+    make=f"{_SPIRL}:make_prior",
+    policy="spirl",
 )
