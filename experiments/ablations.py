@@ -65,7 +65,7 @@ def trained(
       demonstrator: whose dataset (default: that of the world's recipe).
       **changes: what else differs from the world's ``PretrainConfig``.
     """
-    fast = pretrain_preset(config.env, "fast")
+    fast = pretrain_preset(config.world, "fast")
     settings = replace(
         fast,
         data=DataConfig(demonstrator or fast.data.demonstrator, config.num_trajectories),
@@ -90,12 +90,12 @@ def adapted(
       policy_folder: folder of the policy; None for the released one.
       folders: result folders to write, with the hyper-parameters of each.
     """
-    world, env = envs.find(config.env), envs.make(config.env)
+    world, env = envs.find(config.world), envs.make(config.world)
     policy = load_policy(world, policy_folder)
     tasks = test_tasks(world)
     configs = [
         AdaptConfig(
-            env=config.env,
+            env=config.world,
             policy=policy_folder,
             seeds=config.seeds,
             episodes=EPISODES,
@@ -126,7 +126,7 @@ def adapted(
 
 def table4(config: ReproduceConfig) -> list[Line]:
     """Longest prompt K and exploration constant c, with the released policy (Table 4)."""
-    folder, world = config.folder / "table4", envs.find(config.env)
+    folder, world = config.folder / "table4", envs.find(config.world)
     lengths = {
         folder / f"K{k}-{config.seeds}seeds": UCB.hyper_in(world, {"max_goals": k})
         for k in (1, 2, 3, LONGEST)
@@ -161,15 +161,15 @@ def compared(
     for name in chosen(config, names):
         policy = policy_of(name)
         results = config.folder / config.what / f"{policy.parent.name}-{config.seeds}seeds"
-        adapted(config, policy, {results: UCB.hyper_in(envs.find(config.env))})
-        paper = paper_value(config.what, envs.find(config.env).home, name)
+        adapted(config, policy, {results: UCB.hyper_in(envs.find(config.world))})
+        paper = paper_value(config.what, envs.find(config.world).home, name)
         lines.append(Line(label.format(name), results, paper))
     return lines
 
 
 def demonstrators(config: ReproduceConfig) -> list[str]:
     """The names of the world's demonstrators, the default first."""
-    return list(envs.find(config.env).demonstrators(envs.make(config.env)))
+    return list(envs.find(config.world).demonstrators(envs.make(config.world)))
 
 
 def table5(config: ReproduceConfig) -> list[Line]:
@@ -181,7 +181,7 @@ def table5(config: ReproduceConfig) -> list[Line]:
     names = demonstrators(config)
     if len(names) < 2:
         raise UsageError(
-            f"there is no table5 for {config.env}: it compares datasets of several demonstrators; "
+            f"there is no table5 for {config.world}: it compares datasets of several demonstrators; "
             "name another world with --env"
         )
     return compared(config, sorted(names), lambda name: trained(config, name, name))
@@ -204,9 +204,9 @@ def heads(config: ReproduceConfig) -> list[Line]:
     Raises:
       UsageError: for a world with discrete actions.
     """
-    if envs.make(config.env).spec.discrete:
+    if envs.make(config.world).spec.discrete:
         raise UsageError(
-            f"there is no heads for {config.env}: it compares distributions of continuous actions; "
+            f"there is no heads for {config.world}: it compares distributions of continuous actions; "
             "name another world with --env"
         )
     names = [name for name in HEADS if name != "categorical"]
@@ -251,5 +251,5 @@ def save(config: ReproduceConfig, text: str, lines: Sequence[Line]) -> None:
     """Write the table and the learning curves of an ablation."""
     place, picture = files_of(config)
     results = {line.label: load_results(line.results) for line in lines}
-    write(picture, later(learning_curve, results, config.env))
+    write(picture, later(learning_curve, results, config.world))
     write_sealed(place, lambda path: path.write_text(text, encoding="utf-8"))

@@ -66,6 +66,8 @@ class Method:
       check: ``(setting, hyper) -> None``, or its place, raises ``UsageError`` where the method cannot be
         used.
       policy: the kind of network that it starts from (``kinds.KINDS``).
+      learns: whether what it does can change from one episode to the next. If not, one episode of it is
+        worth as much as a whole budget.
       title: its name in legends [the name].
       summary: what it is, in one line.
     """
@@ -75,6 +77,7 @@ class Method:
     hyper: type = NoHyper
     check: str | Callable[[Setting, Any], None] | None = None
     policy: str = MULTI_GOAL
+    learns: bool = True
     title: str = ""
     summary: str = ""
 
@@ -293,6 +296,7 @@ GCBC = Method(
     title="GC-BC",
     summary="goal-conditioned behavior cloning; the prompt stays (g^M) in every episode",
     make=f"{_HERE}:make_gcbc",
+    learns=False,
 )
 
 

@@ -270,7 +270,7 @@ def test_settings_that_do_not_go_together(line: str, says: str, tmp_path, monkey
 @pytest.mark.parametrize(
     ("config", "says"),
     [
-        (ReproduceConfig(), "no ablation given; name one of table4, table5"),
+        (ReproduceConfig(), "no table given; name one of table1, table2"),
         (ReproduceConfig(what="table4", only=("K1",)), "table4 has no use for --only"),
         (ReproduceConfig(what="table4", steps=3), "table4 has no use for --steps"),
         (ReproduceConfig(what="figure8", trajectories=40), "--trajectories must be above 200"),

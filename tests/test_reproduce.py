@@ -13,11 +13,13 @@ import pytest
 import envs
 from envs import episodes
 from envs.errors import DataError, UsageError
-from experiments import ablations
+from experiments import ablations, comparisons
 from experiments.reproduce import main
 from experiments.store import settings as store_settings
+from experiments.store.paper import paper_worlds
 from experiments.store.results import load_results
 from experiments.store.settings import PretrainConfig, ReproduceConfig, pretrain_preset
+from mgpo_jax import methods
 from mgpo_jax.settings import check_settings
 from mgpo_jax.tasks import test_tasks as released_tasks
 
@@ -104,7 +106,7 @@ def test_heads_differ_in_nothing_else(tiny: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(
         ablations, "adapted", lambda config, policy, folders: adapted.extend(folders)
     )
-    lines = ablations.heads(ReproduceConfig(what="heads", env="kitchen", steps=2))
+    lines = ablations.heads(ReproduceConfig(what="heads", env=("kitchen",), steps=2))
     assert [line.label for line in lines] == ["gaussian", "fixed_gaussian", "mixture", "binned"]
     assert [line.results for line in lines] == adapted
     assert [one.head for one in asked] == [line.label for line in lines]
@@ -113,11 +115,68 @@ def test_heads_differ_in_nothing_else(tiny: Path, monkeypatch: pytest.MonkeyPatc
     assert same.pop().data.trajectories == 9_000
 
 
+def test_a_comparison_from_cells_to_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(comparisons, "SMOKE_TASKS", 2)
+    monkeypatch.setattr(comparisons, "SMOKE_EPISODES", 2)
+    monkeypatch.setattr(episodes, "MAX_SEGMENTS", 1)
+    load = comparisons.load_policy
+
+    def loaded(world: Any, path: Any, kind: str) -> Any:
+        if kind == "ptgm":
+            raise UsageError("no policy in that folder")
+        return load(world, path, kind)
+
+    monkeypatch.setattr(comparisons, "load_policy", loaded)
+    config = ReproduceConfig(
+        what="table1", env=("maze15",), scale="smoke", only=("gcbc", "explore")
+    )
+    with pytest.raises(UsageError, match="method of table1"):
+        comparisons.compare(config)
+    config = replace(config, only=("gcbc", "ucb", "ptgm"))
+    text = comparisons.compare(config)
+    _, _, *rows = [line for line in text.splitlines() if line.startswith("|")]
+    gcbc, ucb, ptgm = ([cell.strip() for cell in row.strip("|").split("|")] for row in rows)
+    assert [row[:2] for row in (gcbc, ucb, ptgm)] == [
+        ["maze15", "GC-BC"], ["maze15", "MGPO-UCB"], ["maze15", "PTGM"],
+    ]  # fmt: skip
+    assert gcbc[2] == "-2.63"
+    assert (gcbc[6], ucb[6]) == ("2 x 1 x 1", "2 x 1 x 2")
+    assert float(gcbc[4]) == pytest.approx(float(gcbc[3]) + 2.63, abs=2e-3)
+    assert ptgm[2:] == ["-0.96 ± 0.08", *["-"] * 5]
+    assert "- maze15: no policy in that folder" in text
+    assert "Scaled down: 2 tasks, 1 seed, 2 episodes" in text
+    assert comparisons.files_of(config)[1].stat().st_size > 0
+
+    def never(*args: Any, **options: Any) -> None:
+        raise AssertionError("what is finished was done again")
+
+    monkeypatch.setattr(comparisons, "adapt_and_save", never)
+    assert comparisons.compare(config) == text
+
+
+def test_published_cells_are_used_if_they_are_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = comparisons.cell_config(ReproduceConfig(what="table2"), "maze15", "ucb")
+    assert comparisons.published(settings) == Path("results/maze15/ucb")
+    assert comparisons.published(replace(settings, seeds=2)) is None
+    monkeypatch.chdir(tmp_path)
+    assert comparisons.published(settings) is None
+
+
+def test_every_method_of_a_comparison_is_known() -> None:
+    for name, comparison in comparisons.TABLES.items():
+        for method in (*comparison.methods, *comparison.further):
+            assert methods.find(method).name == method
+        assert set(paper_worlds(name)) >= {"maze15", "maze30", "kitchen", "gridworld"}
+
+
 @pytest.mark.parametrize(
     ("config", "says"),
     [
         (ReproduceConfig(what="tabel5"), "did you mean 'table5'"),
-        (ReproduceConfig(what="table5", env="gridworld"), "no table5 for gridworld"),
+        (ReproduceConfig(what="table5", env=("gridworld",)), "no table5 for gridworld"),
         (
             ReproduceConfig(what="heads"),
             "no heads for maze15: it compares distributions of continuous",
@@ -125,6 +184,9 @@ def test_heads_differ_in_nothing_else(tiny: Path, monkeypatch: pytest.MonkeyPatc
         (ReproduceConfig(what="table5", only=("astar3",)), "did you mean 'astar"),
         (ReproduceConfig(what="figure8", only=("41",)), "row of figure8"),
         (ReproduceConfig(what="table4", steps=0), "--steps must be at least 1"),
+        (ReproduceConfig(what="table1", steps=5), "table1 has no use for --steps 5"),
+        (ReproduceConfig(what="table4", scale="smoke"), "table4 has no use for --scale smoke"),
+        (ReproduceConfig(what="table1", env=("maze51",)), "did you mean 'maze15'"),
     ],
 )
 def test_usage_errors(
@@ -144,9 +206,9 @@ def test_usage_errors(
 def test_budgets_are_those_of_the_worlds_preset() -> None:
     sizes = {"maze15": (2_000, 10_000), "maze30": (1_000, 10_000), "kitchen": (1_000, 9_000)}
     for env, size in sizes.items():
-        config = ReproduceConfig(what="table4", env=env)
+        config = ReproduceConfig(what="table4", env=(env,))
         assert (config.num_steps, config.num_trajectories) == size
-    config = ReproduceConfig(what="table4", env="gridworld")  # has none: those of its recipe
+    config = ReproduceConfig(what="table4", env=("gridworld",))  # has none: those of its recipe
     assert (config.num_steps, config.num_trajectories) == (3_000, 68_000)
     assert "ablation" not in envs.find("gridworld").presets
 

@@ -393,6 +393,14 @@ def test_a_policy_is_found_where_it_was_moved_with_its_results(
         load_policy_of(loaded, TINY)
 
 
+def test_the_first_episode_may_be_judged_twice(tmp_path: Path) -> None:
+    """Before it and after it, as where a choice is judged after every episode."""
+    results = made_results()
+    save_results(tmp_path / "one", with_summary(results, "0" * 64))
+    rewrite("results.npz", eval_episodes=np.array([1, 1]))(tmp_path / "one")
+    np.testing.assert_array_equal(load_results(tmp_path / "one").eval_episodes, [1, 1])
+
+
 def test_a_damaged_policy_does_not_hide_a_sound_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

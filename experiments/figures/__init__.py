@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from experiments.figures.curves import learning_curve, training_curve
+from experiments.figures.curves import learning_curve, learning_curves, training_curve
 from experiments.figures.rollouts import Play, Save, figures_of_results, figures_of_run, later
 from experiments.figures.style import METHODS, STYLE, Look, method_styles
 
@@ -16,6 +16,7 @@ __all__ = [
     "figures_of_run",
     "later",
     "learning_curve",
+    "learning_curves",
     "method_styles",
     "training_curve",
 ]

@@ -23,7 +23,31 @@ def learning_curve(results: Mapping[str, Results], title: str | None = None) -> 
     is drawn where the optimum is known.
     """
     figure = Figure(figsize=(4.8, 2.7), layout="constrained")
-    ax = figure.add_subplot()
+    _draw_curves(figure.add_subplot(), results, title)
+    figure.legend(loc="outside right upper")
+    return figure
+
+
+@styled
+def learning_curves(results: Mapping[str, Mapping[str, Results]]) -> Figure:
+    """Figures 6 and 7 whole: a panel of learning curves for each world, with one legend."""
+    figure = Figure(figsize=(2.5 * len(results), 2.6), layout="constrained")
+    panels = figure.subplots(1, len(results), squeeze=False)[0]
+    for ax, (world, of_world) in zip(panels, results.items(), strict=True):
+        _draw_curves(ax, of_world, world)
+        ax.set_ylabel("" if ax is not panels[0] else "judged return")
+    entries = {
+        label: line
+        for ax in panels
+        for line, label in zip(*ax.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(
+        entries.values(), entries.keys(), loc="outside lower center", ncols=2 * len(results)
+    )
+    return figure
+
+
+def _draw_curves(ax: Any, results: Mapping[str, Results], title: str | None) -> None:
     for label, (name, color, line, marker) in method_styles(results).items():
         result = results[label]
         by_seed = result.eval_returns.mean(axis=1)
@@ -44,8 +68,6 @@ def learning_curve(results: Mapping[str, Results], title: str | None = None) -> 
     ax.set(xlabel="episodes", ylabel="return of the optimized prompt", title=plain(title or ""))
     ax.set_xlim(left=0)
     ax.margins(y=0.08)
-    figure.legend(loc="outside right upper")
-    return figure
 
 
 @styled

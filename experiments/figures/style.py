@@ -74,10 +74,21 @@ METHODS = {
         "grips": ("#CC79A7", "--", "D"),
         "bbt": ("#56B4E9", "--", "v"),
         "gcbc": ("#6B6B6B", ":", "P"),
+        "ppo": ("#8C510A", "-.", "v"),
+        "ppo-careful": ("#C49A6C", "-.", "^"),
+        "reinforce": ("#B2182B", "-.", "D"),
+        "reinforce-careful": ("#E08A8A", "-.", "s"),
+        "spirl": ("#5E3C99", "--", "o"),
+        "spirl-prior": ("#B2ABD2", ":", "o"),
+        "ptgm": ("#003C30", "--", "X"),
+        "ptgm-goal": ("#35978F", "--", "P"),
+        "ptgm-random": ("#A6BDBB", ":", "X"),
+        "ptgm-prior": ("#7FA8A3", ":", "s"),
+        "ptgm-oracle": ("#01665E", ":", "D"),
     }.items()
 }
 # For methods without a look of their own: all colors with solid lines, then all with dashed ones.
-SPARE_COLORS = ("#E69F00", "#8C510A", "#5E3C99", "#B2182B", "#003C30", "#35978F")
+SPARE_COLORS = ("#E69F00", "#A65628", "#7570B3", "#E7298A", "#1B7837", "#4D4D4D")
 SPARE_STYLES = [
     (color, line, marker)
     for line in ("-", "--")

@@ -24,6 +24,11 @@ def paper_rows(table: str, world: str) -> dict[str, Any]:
     return _numbers().get(table, {}).get(world, {})
 
 
+def paper_worlds(table: str) -> tuple[str, ...]:
+    """The worlds that a table of the paper has, in its order."""
+    return tuple(_numbers().get(table, {}))
+
+
 METHODS_IN = ("table2", "table1", "table8")
 """The tables with a row for each method, whose numbers agree where two of them have a method."""
 

@@ -475,7 +475,9 @@ def _parts_of_choices(stored: Mapping[str, str]) -> list[str]:
 def _check_values(arrays: Mapping[str, np.ndarray], path: Path) -> None:
     """Raise ``DataError`` for numbers that contradict each other."""
     judged, num = arrays["eval_episodes"], arrays["returns"].shape[2]
-    if (np.diff(judged) <= 0).any() or judged[-1] > num:
+    # The first is of the initial choice, the second may be of what the first episode has changed.
+    descends = (np.diff(judged) < 0).any() or (np.diff(judged[1:]) <= 0).any()
+    if descends or judged[-1] > num:
         raise DataError(
             f"{path}: eval_episodes must ascend from 1 to at most {num}, found "
             f"{shown(judged.tolist())}; {ADAPT_AGAIN}"

@@ -12,7 +12,7 @@ import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import tyro
 from pydantic import BaseModel
@@ -462,12 +462,18 @@ class ReproduceConfig(Common):
     """Settings of ``experiments.reproduce``."""
 
     what: tyro.conf.Positional[str] = ""
-    """table4 (prompt length and c of UCB), table5 (datasets), figure8 (longer prompts) or heads
-    (distributions of continuous actions)."""
-    env: Name = DEFAULT_WORLD
-    """The world, by name or as module:attribute."""
+    """table1, table2, table8 (methods in all worlds), table4 (prompt length and c of UCB), table5
+    (datasets), figure8 (longer prompts), heads (distributions of continuous actions), or list (what each
+    costs and what is there)."""
+    env: tuple[Name, ...] = ()
+    """The worlds, by name or as module:attribute (default: those of the paper's table; of an ablation,
+    maze15)."""
+    scale: Literal["smoke", "cpu", "paper"] = "cpu"
+    """Of table1, table2 and table8: cpu has the released networks and the paper's budget, smoke five tasks,
+    one seed and 20 episodes, and paper networks that are trained by the preset of that name."""
     only: tuple[Name, ...] = ()
-    """Names of the datasets (table5), prompt lengths (figure8) or heads to train (default: all)."""
+    """Names of the datasets (table5), prompt lengths (figure8) or heads to train, or of the methods of a
+    comparison (default: all)."""
     steps: Count | None = None
     """Gradient steps of each training (default: those of the world's preset "ablation")."""
     trajectories: Annotated[NumTrajectories | None, tyro.conf.arg(aliases=("--episodes",))] = None
@@ -478,29 +484,47 @@ class ReproduceConfig(Common):
     """Folder of all trainings and results; tables share what they have in common."""
 
     @property
+    def world(self) -> str:
+        """The one world of an ablation."""
+        return self.env[0] if self.env else DEFAULT_WORLD
+
+    @property
     def folder(self) -> Path:
-        return self.out / file_name(self.env)
+        return self.out / file_name(self.world)
 
     @property
     def num_steps(self) -> int:
-        return self.steps or self._preset("steps", pretrain_preset(self.env, "fast").train.steps)
+        return self.steps or self._preset("steps", pretrain_preset(self.world, "fast").train.steps)
 
     @property
     def num_trajectories(self) -> int:
-        default = pretrain_preset(self.env, "fast").data.trajectories
+        default = pretrain_preset(self.world, "fast").data.trajectories
         return self.trajectories or self._preset("trajectories", default)
 
     def _preset(self, name: str, default: int) -> int:
-        return envs.find(self.env).presets.get("ablation", {}).get(name, default)
+        return envs.find(self.world).presets.get("ablation", {}).get(name, default)
+
+
+COMPARISONS = ("table1", "table2", "table8")
+"""What ``experiments.reproduce`` makes of several methods in several worlds."""
 
 
 def check_reproduction(config: ReproduceConfig) -> None:
     """Raise ``UsageError`` for settings of ``experiments.reproduce`` that do not go together."""
+    if config.what in COMPARISONS:
+        for name in ("steps", "trajectories"):
+            if value := getattr(config, name):
+                raise UsageError(
+                    f"{config.what} has no use for {flag(name)} {shown(value)}; leave it out"
+                )
+        return
+    if config.scale != "cpu":
+        raise UsageError(f"{config.what} has no use for --scale {config.scale}; leave it out")
     if config.what == "table4":  # which trains nothing
         for name in ("only", "steps", "trajectories"):
             if value := getattr(config, name):
                 raise UsageError(f"table4 has no use for {flag(name)} {shown(value)}; leave it out")
-    elif config.num_trajectories <= (kept := pretrain_preset(config.env, "fast").holdout):
+    elif config.num_trajectories <= (kept := pretrain_preset(config.world, "fast").holdout):
         raise UsageError(
             f"--trajectories must be above {kept}, the trajectories kept out of training, found "
             f"{config.num_trajectories}"

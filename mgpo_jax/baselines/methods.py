@@ -204,6 +204,7 @@ PTGM_RANDOM = Method(
     title="PTGM's low level, random goals",
     summary="reference of PTGM: any goal with the same probability",
     make=f"{_PTGM}:make_random",
+    learns=False,
     policy="ptgm",
 )
 PTGM_PRIOR = Method(
@@ -211,6 +212,7 @@ PTGM_PRIOR = Method(
     title="PTGM's low level, goals of the prior",
     summary="reference of PTGM: goals drawn from the prior",
     make=f"{_PTGM}:make_prior",
+    learns=False,
     policy="ptgm",
 )
 PTGM_ORACLE = Method(
@@ -218,6 +220,7 @@ PTGM_ORACLE = Method(
     title="PTGM's low level, an expert's goals",
     summary="reference of PTGM: the goals that an expert tells who knows the task",
     make=f"{_PTGM}:make_oracle",
+    learns=False,
     check=f"{_PTGM}:check_oracle",
     policy="ptgm",
 )
@@ -238,5 +241,6 @@ SPIRL_PRIOR = Method(
     title="SPiRL's skills, drawn from the prior",
     summary="reference of SPiRL: skills drawn from the prior in every episode",
     make=f"{_SPIRL}:make_prior",
+    learns=False,
     policy="spirl",
 )

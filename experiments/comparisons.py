@@ -1,0 +1,300 @@
+"""The paper's comparisons of methods in several worlds (Tables 1, 2 and 8; Figures 6 and 7), cell by cell.
+
+A cell is one adaptation, which lies in a folder of its own and can be resumed by itself. What was published
+under ``results/`` is taken from there if it is of the same weights, tasks and settings.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+
+import envs
+from envs.errors import DataError, UsageError, nearest
+from experiments.adaptation import adapt_and_save, finished
+from experiments.drawing import write
+from experiments.figures import later, learning_curves
+from experiments.store import runs
+from experiments.store.paper import paper_final, paper_worlds
+from experiments.store.results import load_results
+from experiments.store.rows import PAPER_EPISODES, read_row
+from experiments.store.seals import check_replaceable, write_sealed
+from experiments.store.settings import AdaptConfig, ReproduceConfig, file_name, pretrain_preset
+from experiments.store.statistics import SeedSpread
+from experiments.store.summary import Summary, read_summary
+from experiments.store.tables import number, table
+from experiments.training import train
+from mgpo_jax import methods
+from mgpo_jax.policy_files import load_policy
+from mgpo_jax.tasks import num_tasks, test_tasks
+
+PUBLISHED = Path("results")
+GO_ON = "run the same command again to go on"
+SMOKE_TASKS, SMOKE_EPISODES = 5, 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """What a table of the paper compares.
+
+    Attributes:
+      title: what it is.
+      methods: those that the paper has.
+      further: ours beside them: variants, and references that learn nothing.
+      figure: number of the figure with its learning curves.
+    """
+
+    title: str
+    methods: tuple[str, ...]
+    further: tuple[str, ...] = ()
+    figure: int | None = None
+
+
+TABLES: Mapping[str, Comparison] = {
+    "table1": Comparison(
+        title="Table 1: MGPO and other methods",
+        methods=("gcbc", "ppo", "spirl", "ptgm", "ucb"),
+        further=(
+            "ppo-careful", "spirl-prior", "ptgm-goal", "ptgm-random", "ptgm-prior", "ptgm-oracle",
+        ),
+        figure=6,
+    ),
+    "table2": Comparison(
+        title="Table 2: prompt optimization methods",
+        methods=("grips", "bbt", "explore", "ucb", "bpe"),
+        figure=7,
+    ),
+    "table8": Comparison(
+        title="Table 8: BC-finetune with two algorithms",
+        methods=("reinforce", "ppo"),
+        further=("reinforce-careful", "ppo-careful"),
+    ),
+}  # fmt: skip
+
+
+class Cell(NamedTuple):
+    """One method in one world."""
+
+    world: str
+    method: str
+    results: Path | None
+    """Its folder; None where it cannot be had."""
+    reason: str = ""
+    """Why it cannot be had."""
+
+
+@dataclass(frozen=True)
+class Notes:
+    """What a table says below its rows, each line once."""
+
+    lines: list[str] = field(default_factory=list)
+
+    def add(self, line: str) -> None:
+        if line not in self.lines:
+            self.lines.append(line)
+
+
+def worlds_of(config: ReproduceConfig) -> Sequence[str]:
+    """The worlds of a comparison: those that are asked for, or the paper's."""
+    return config.env or paper_worlds(config.what)
+
+
+def methods_of(config: ReproduceConfig) -> Sequence[str]:
+    """The methods of a comparison, those that ``--only`` leaves.
+
+    Raises:
+      UsageError: for one that the comparison does not have.
+    """
+    comparison = TABLES[config.what]
+    known = (*comparison.methods, *comparison.further)
+    for name in config.only:
+        if name not in known:
+            raise nearest(name, known, f"method of {config.what}")
+    return config.only or known
+
+
+def cell_config(config: ReproduceConfig, world: str, method: str) -> AdaptConfig:
+    """The settings of the adaptation of one cell. A method that learns nothing needs one episode."""
+    smoke = config.scale == "smoke"
+    seeds = 1 if smoke else config.seeds
+    budget = SMOKE_EPISODES if smoke else PAPER_EPISODES
+    learns = methods.find(method).learns
+    name = f"{file_name(method)}-{config.scale}-{seeds}seeds"
+    return AdaptConfig(
+        env=world,
+        method=method,
+        policy=_trained_policy(config, world, method) if config.scale == "paper" else None,
+        seeds=seeds,
+        episodes=budget if learns else 1,
+        eval_every=10 if learns else 1,
+        out=config.out / file_name(world) / "methods" / name,
+        resume=True,
+        figures=False,
+        hyper=methods.find(method).hyper_in(envs.find(world)),
+    )
+
+
+def _trained_policy(config: ReproduceConfig, world: str, method: str) -> Path:
+    """Where the network of the preset "paper" lies that a method starts from."""
+    kind = methods.find(method).policy
+    return config.out / file_name(world) / "policies" / f"paper-{kind}" / runs.POLICY
+
+
+def made(config: ReproduceConfig, world: str, method: str) -> Cell:
+    """A cell that is there: published, finished before, or adapted now.
+
+    Worlds that are not installed and networks that are not released make it an empty one.
+    """
+    settings = cell_config(config, world, method)
+    if config.scale == "cpu" and (place := published(settings)) is not None:
+        return Cell(world, method, place)
+    try:
+        record, env = envs.find(world), envs.make(world)
+        if settings.policy is not None:
+            _train(settings.policy.parent, world, methods.find(method).policy)
+        policy = load_policy(record, settings.policy, methods.find(method).policy)
+        tasks = test_tasks(record)
+        if config.scale == "smoke":
+            tasks = jax.tree.map(lambda leaf: leaf[:SMOKE_TASKS], tasks)
+        folder = settings.folder
+        if folder.is_dir():
+            finished(folder, settings, policy, tasks)
+        else:
+            print(f"{method} in {world}: {num_tasks(tasks)} tasks", file=sys.stderr)
+            adapt_and_save(folder, settings, record, env, policy, tasks)
+    except UsageError as error:
+        return Cell(world, method, None, str(error))
+    return Cell(world, method, folder)
+
+
+def _train(folder: Path, world: str, kind: str) -> None:
+    """Train a network by the preset "paper", or go on with its training."""
+    if runs.is_finished(folder):
+        return
+    preset = pretrain_preset(world, "paper", kind)
+    print(f"training {folder}", file=sys.stderr)
+    train(replace(preset, out=folder, resume=runs.has_begun(folder)), GO_ON)
+
+
+def published(settings: AdaptConfig) -> Path | None:
+    """The published results of the settings of a cell; None if there are none, or others."""
+    folder = PUBLISHED / file_name(settings.env) / file_name(settings.method)
+    if not folder.is_dir():
+        return None
+    try:
+        row = read_row(folder)
+    except DataError as error:
+        print(f"{folder} is not used: {error}", file=sys.stderr)
+        return None
+    summary = row.summary
+    size = (summary["num_seeds"], summary["num_episodes"])
+    same = row.tasks == "test" and size == (settings.seeds, settings.episodes)
+    return folder if same and not row.settings.keys() - {"eval_every"} else None
+
+
+def cells(config: ReproduceConfig) -> Iterator[Cell]:
+    """All cells of a comparison, world by world; each is made when it is asked for."""
+    for world in worlds_of(config):
+        for method in methods_of(config):
+            yield made(config, world, method)
+
+
+HEAD = (
+    "world", "method", "paper", "ours (mean ± std over seeds)", "gap", "best single episode",
+    "tasks x seeds x episodes", "CPU-minutes",
+)  # fmt: skip
+
+
+def as_table(found: Sequence[Cell], scale: str = "cpu") -> str:
+    """The table in Markdown, with notes on what is missing or scaled down."""
+    notes = Notes()
+    rows = [_row(cell, scale, notes) for cell in found]
+    below = "".join(f"- {line}\n" for line in notes.lines)
+    return f"{table(HEAD, rows)}\n" + (f"\n{below}" if below else "")
+
+
+def _row(cell: Cell, scale: str, notes: Notes) -> list[str]:
+    paper = paper_final(cell.world, cell.method)
+    title = methods.find(cell.method).title or cell.method
+    if cell.results is None:
+        notes.add(f"{cell.world}: {cell.reason}")
+        return [cell.world, title, paper, *["-"] * (len(HEAD) - 3)]
+    summary = read_summary(cell.results)
+    ours = SeedSpread(summary["final_return"], summary["final_return_std_over_seeds"])
+    size = (summary["num_tasks"], summary["num_seeds"], summary["num_episodes"])
+    if scale == "smoke":
+        notes.add(
+            f"Scaled down: {size[0]} tasks, {size[1]} seed, {SMOKE_EPISODES} episodes, where the paper has "
+            f"3 seeds and {PAPER_EPISODES} episodes. These numbers only show that everything runs."
+        )
+    elif size[1] < 3:
+        notes.add(f"{cell.world}, {title}: {size[1]} seed(s), where the paper has 3.")
+    if not methods.find(cell.method).learns:
+        notes.add(f"{title} learns nothing, so that its budget is one episode.")
+    return [
+        cell.world,
+        title,
+        paper,
+        str(ours),
+        _gap(paper, summary),
+        number(summary.get("best_episode_return")),
+        " x ".join(map(str, size)),
+        f"{summary['cpu_seconds'] / 60:.1f}",
+    ]
+
+
+def _gap(paper: str, summary: Summary) -> str:
+    """Ours minus the paper's; empty where the paper has nothing."""
+    return f"{summary['final_return'] - float(paper.split()[0]):+.3f}" if paper else ""
+
+
+def files_of(config: ReproduceConfig) -> tuple[Path, Path]:
+    """Where the table and the curves of a comparison are written."""
+    place = config.out / f"{config.what}-{config.scale}"
+    return place.with_suffix(".md"), place.with_suffix(".png")
+
+
+def compare(config: ReproduceConfig) -> str:
+    """Make all cells that are missing, and write the table and the learning curves; returns the table."""
+    place, picture = files_of(config)
+    check_replaceable((place, picture))
+    found = list(cells(config))
+    text = f"{TABLES[config.what].title}\n\n{as_table(found, config.scale)}"
+    place.parent.mkdir(parents=True, exist_ok=True)
+    write_sealed(place, lambda path: path.write_text(text, encoding="utf-8"))
+    curves = _curves(found)
+    if curves:
+        write(picture, later(learning_curves, curves))
+    return text
+
+
+def _curves(found: Sequence[Cell]) -> dict[str, dict[str, Any]]:
+    """The results that have learning curves, by world and method."""
+    curves: dict[str, dict[str, Any]] = {}
+    for cell in found:
+        if cell.results is not None and methods.find(cell.method).learns:
+            curves.setdefault(cell.world, {})[cell.method] = load_results(cell.results)
+    return curves
+
+
+def costs(config: ReproduceConfig) -> str:
+    """What each comparison has already, and what that took."""
+    rows = []
+    for name, comparison in TABLES.items():
+        asked = replace(config, what=name, only=())
+        for world in worlds_of(asked):
+            have, spent = 0, 0.0
+            known = (*comparison.methods, *comparison.further)
+            for method in known:
+                settings = cell_config(asked, world, method)
+                folder = settings.folder if settings.folder.is_dir() else published(settings)
+                if folder is not None:
+                    have += 1
+                    spent += read_summary(folder)["cpu_seconds"] / 60
+            rows.append([name, world, f"{have} of {len(known)}", f"{spent:.0f}"])
+    return table(("what", "world", "cells there", "CPU-minutes of those"), rows)
