@@ -41,7 +41,7 @@ from mgpo_jax.schema import ArrayField, array_names, read_arrays, read_document
 
 PAPER_EPISODES = 100  # the paper's budget for one task
 SHOWN = ("policy", "seed", "eval_every", "eval_episodes")  # settings that every method has
-STATED = {"seed"}  # may differ beside the paper's number, since the row states it
+STATED = {"seed", "eval_every"}  # may differ beside the paper's number, since the row states it
 
 
 class Row(NamedTuple):
