@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ import jax
 import envs
 from envs.errors import DataError, UsageError, nearest
 from experiments.adaptation import adapt_and_save, finished
-from experiments.drawing import write
+from experiments.drawing import pictures_together, write
 from experiments.figures import later, learning_curves
 from experiments.store import runs
 from experiments.store.paper import paper_final, paper_worlds
@@ -46,13 +47,11 @@ class Comparison:
       title: what it is.
       methods: those that the paper has.
       further: ours beside them: variants, and references that learn nothing.
-      figure: number of the figure with its learning curves.
     """
 
     title: str
     methods: tuple[str, ...]
     further: tuple[str, ...] = ()
-    figure: int | None = None
 
 
 TABLES: Mapping[str, Comparison] = {
@@ -62,12 +61,10 @@ TABLES: Mapping[str, Comparison] = {
         further=(
             "ppo-careful", "spirl-prior", "ptgm-goal", "ptgm-random", "ptgm-prior", "ptgm-oracle",
         ),
-        figure=6,
     ),
     "table2": Comparison(
         title="Table 2: prompt optimization methods",
         methods=("grips", "bbt", "explore", "ucb", "bpe"),
-        figure=7,
     ),
     "table8": Comparison(
         title="Table 8: BC-finetune with two algorithms",
@@ -75,6 +72,25 @@ TABLES: Mapping[str, Comparison] = {
         further=("reinforce-careful", "ppo-careful"),
     ),
 }  # fmt: skip
+CURVES_OF = {"figure6": "table1", "figure7": "table2"}
+"""The tables whose learning curves the figures are."""
+
+
+class Picture(NamedTuple):
+    """A figure of prompts, or of what is done under them."""
+
+    methods: tuple[str, ...]
+    pattern: str
+    """Of the names of its files among those that ``experiments.plot`` draws."""
+
+
+PICTURES: Mapping[str, Picture] = {
+    "figure2": Picture(TABLES["table2"].methods, "*_prompts.png"),
+    "figure3": Picture(("ucb",), "*_evolution_*.png"),
+    "figure5": Picture(("ucb",), "*.gif"),
+    "figure9": Picture(("ucb",), "*_short_and_long.png"),
+    "figure10": Picture(("ucb",), "*_evolution_*.png"),
+}
 
 
 class Cell(NamedTuple):
@@ -101,7 +117,12 @@ class Notes:
 
 def worlds_of(config: ReproduceConfig) -> Sequence[str]:
     """The worlds of a comparison: those that are asked for, or the paper's."""
-    return config.env or paper_worlds(config.what)
+    return config.env or paper_worlds(CURVES_OF.get(config.what, config.what))
+
+
+def table_of(config: ReproduceConfig) -> Comparison:
+    """What is compared."""
+    return TABLES[CURVES_OF.get(config.what, config.what)]
 
 
 def methods_of(config: ReproduceConfig) -> Sequence[str]:
@@ -110,7 +131,7 @@ def methods_of(config: ReproduceConfig) -> Sequence[str]:
     Raises:
       UsageError: for one that the comparison does not have.
     """
-    comparison = TABLES[config.what]
+    comparison = table_of(config)
     known = (*comparison.methods, *comparison.further)
     for name in config.only:
         if name not in known:
@@ -264,7 +285,7 @@ def compare(config: ReproduceConfig) -> str:
     place, picture = files_of(config)
     check_replaceable((place, picture))
     found = list(cells(config))
-    text = f"{TABLES[config.what].title}\n\n{as_table(found, config.scale)}"
+    text = f"{table_of(config).title}\n\n{as_table(found, config.scale)}"
     place.parent.mkdir(parents=True, exist_ok=True)
     write_sealed(place, lambda path: path.write_text(text, encoding="utf-8"))
     curves = _curves(found)
@@ -280,6 +301,38 @@ def _curves(found: Sequence[Cell]) -> dict[str, dict[str, Any]]:
         if cell.results is not None and methods.find(cell.method).learns:
             curves.setdefault(cell.world, {})[cell.method] = load_results(cell.results)
     return curves
+
+
+def draw(config: ReproduceConfig) -> list[Path]:
+    """Draw a figure of prompts in each of its worlds, of adaptations that are made where they are missing.
+
+    Returns the files.
+
+    Raises:
+      UsageError: if a world or a network is missing, or a world draws no such figure.
+    """
+    figure = PICTURES[config.what]
+    drawn: list[Path] = []
+    for world in worlds_of(config):
+        results = {}
+        for method in figure.methods:
+            cell = made(config, world, method)
+            if cell.results is None:
+                raise UsageError(f"there is no {config.what} for {world}: {cell.reason}")
+            results[method] = load_results(cell.results)
+        saves = {
+            config.out / f"{config.what}-{config.scale}_{name}": save
+            for name, save in pictures_together(results, (), seed=0)
+            if fnmatch(name, figure.pattern)
+        }
+        if not saves:
+            raise UsageError(f"there is no {config.what} for {world}, which draws nothing like it")
+        check_replaceable(saves)
+        config.out.mkdir(parents=True, exist_ok=True)
+        for path, save in saves.items():
+            write(path, save)
+        drawn += saves
+    return drawn
 
 
 def costs(config: ReproduceConfig) -> str:

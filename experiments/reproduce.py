@@ -18,7 +18,12 @@ from typing import NoReturn
 import envs
 from envs.errors import UsageError, nearest
 from experiments.runtime import run, say
-from experiments.store.settings import COMPARISONS, ReproduceConfig, check_reproduction
+from experiments.store.settings import (
+    COMPARISONS,
+    PICTURES,
+    ReproduceConfig,
+    check_reproduction,
+)
 from mgpo_jax.claims import check_place
 
 ABLATIONS = ("table4", "table5", "figure8", "heads")
@@ -27,7 +32,7 @@ LIST = "list"
 
 def main(config: ReproduceConfig) -> None:
     """Reproduce a table of the paper: train, adapt, print the table, draw the curves."""
-    known = (*COMPARISONS, *ABLATIONS, LIST)
+    known = (*COMPARISONS, *PICTURES, *ABLATIONS, LIST)
     if not config.what:
         raise UsageError(f"no table given; name one of {', '.join(known)}")
     if config.what not in known:
@@ -35,7 +40,7 @@ def main(config: ReproduceConfig) -> None:
     for world in config.env:
         envs.find(world)
     check_reproduction(config)
-    if config.what in (LIST, *COMPARISONS):
+    if config.what in (LIST, *COMPARISONS, *PICTURES):
         return make_comparison(config)
     for world in config.env or (config.world,):
         make_ablation(replace(config, env=(world,)))
@@ -43,13 +48,16 @@ def main(config: ReproduceConfig) -> None:
 
 
 def make_comparison(config: ReproduceConfig) -> None:
-    """Make a table of several methods and worlds, or tell what there is of all of them."""
+    """Make a table or figure of several methods and worlds, or tell what there is of all of them."""
     if not os.path.isdir(config.out):
         check_place(config.out)
-    from experiments.comparisons import compare, costs, files_of
+    from experiments.comparisons import compare, costs, draw, files_of
 
     if config.what == LIST:
         say(costs(config))
+        return
+    if config.what in PICTURES:
+        draw(config)  # which says what it has written
         return
     say(compare(config))
     print(f"table and curves in {files_of(config)[0]} and .png", file=sys.stderr)

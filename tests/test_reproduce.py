@@ -165,6 +165,21 @@ def test_published_cells_are_used_if_they_are_the_same(
     assert comparisons.published(settings) is None
 
 
+def test_figures_are_drawn_of_published_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(*args: Any, **options: Any) -> None:
+        raise AssertionError("what is published was done again")
+
+    monkeypatch.setattr(comparisons, "adapt_and_save", never)
+    config = ReproduceConfig(what="figure2", out=tmp_path)
+    (drawn,) = comparisons.draw(config)
+    assert drawn == tmp_path / "figure2-cpu_maze15_prompts.png"
+    assert drawn.stat().st_size > 0
+    with pytest.raises(UsageError, match="there is no figure2 for crafter"):
+        comparisons.draw(replace(config, env=("crafter",)))
+
+
 def test_every_method_of_a_comparison_is_known() -> None:
     for name, comparison in comparisons.TABLES.items():
         for method in (*comparison.methods, *comparison.further):

@@ -240,7 +240,7 @@ def test_a_policy_that_was_not_released_is_stated() -> None:
         ({"seed": 4}, {"seed": "4"}, True),
         ({"policy": "runs/mine"}, {"policy": "runs/mine"}, False),
         ({"eval_episodes": 3}, {"eval_episodes": "3"}, False),
-        ({"eval_every": 5}, {"eval_every": "5"}, False),
+        ({"eval_every": 5}, {"eval_every": "5"}, True),
         ({"hyper": {"max_goals": None, "keep_rewarded": True, "c": 2.0}}, {"c": "2"}, False),
         ({"hyper": {"max_goals": 7, "c": 1}}, {"max_goals": "7"}, False),
         ({"policy": "x" * 300}, {"policy": "x" * 28 + "..." + "x" * 28}, False),

@@ -25,8 +25,9 @@ def paper_rows(table: str, world: str) -> dict[str, Any]:
 
 
 def paper_worlds(table: str) -> tuple[str, ...]:
-    """The worlds that a table of the paper has, in its order."""
-    return tuple(_numbers().get(table, {}))
+    """The worlds that a table or figure of the paper has, in its order."""
+    numbers = _numbers()
+    return tuple(numbers.get(table, numbers["figures"].get(table, ())))
 
 
 METHODS_IN = ("table2", "table1", "table8")

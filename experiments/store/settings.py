@@ -462,15 +462,17 @@ class ReproduceConfig(Common):
     """Settings of ``experiments.reproduce``."""
 
     what: tyro.conf.Positional[str] = ""
-    """table1, table2, table8 (methods in all worlds), table4 (prompt length and c of UCB), table5
-    (datasets), figure8 (longer prompts), heads (distributions of continuous actions), or list (what each
-    costs and what is there)."""
+    """table1, table2, table8 (methods in all worlds), figure6, figure7 (the same with their curves),
+    figure2, figure3, figure5, figure9, figure10 (prompts and what is done under them), table4 (prompt
+    length and c of UCB), table5 (datasets), figure8 (longer prompts), heads (distributions of continuous
+    actions), or list (what each costs and what is there)."""
     env: tuple[Name, ...] = ()
     """The worlds, by name or as module:attribute (default: those of the paper's table; of an ablation,
     maze15)."""
     scale: Literal["smoke", "cpu", "paper"] = "cpu"
-    """Of table1, table2 and table8: cpu has the released networks and the paper's budget, smoke five tasks,
-    one seed and 20 episodes, and paper networks that are trained by the preset of that name."""
+    """Of what compares methods or draws adaptations: cpu has the released networks and the paper's budget,
+    smoke five tasks, one seed and 20 episodes, and paper networks that are trained by the preset of that
+    name."""
     only: tuple[Name, ...] = ()
     """Names of the datasets (table5), prompt lengths (figure8) or heads to train, or of the methods of a
     comparison (default: all)."""
@@ -505,13 +507,15 @@ class ReproduceConfig(Common):
         return envs.find(self.world).presets.get("ablation", {}).get(name, default)
 
 
-COMPARISONS = ("table1", "table2", "table8")
+COMPARISONS = ("table1", "table2", "table8", "figure6", "figure7")
 """What ``experiments.reproduce`` makes of several methods in several worlds."""
+PICTURES = ("figure2", "figure3", "figure5", "figure9", "figure10")
+"""What it draws of adaptations."""
 
 
 def check_reproduction(config: ReproduceConfig) -> None:
     """Raise ``UsageError`` for settings of ``experiments.reproduce`` that do not go together."""
-    if config.what in COMPARISONS:
+    if config.what in (*COMPARISONS, *PICTURES):
         for name in ("steps", "trajectories"):
             if value := getattr(config, name):
                 raise UsageError(
