@@ -13,6 +13,7 @@ import numpy as np
 from envs.base import Environment, Task
 from envs.errors import UsageError
 from envs.registry import World
+from experiments.runtime import expect_compiling
 from experiments.store.layout import META
 from experiments.store.policies import check_weights
 from experiments.store.provenance import provenance
@@ -116,6 +117,7 @@ def adapt_and_save(
     """
     settings = deciding(config, policy, tasks)
     with long_work(folder, settings, provenance(), config.resume) as work:
+        expect_compiling()
         (outcome,) = adapt_all(world, env, policy, tasks, [config], work.journal)
         results = results_with_summary(config, env, policy, tasks, outcome)
         write_results(work.place, results, folder, work.meta)

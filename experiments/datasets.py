@@ -24,7 +24,7 @@ from envs.base import Demonstrator, Environment, Episode
 from envs.episodes import run_episode
 from envs.errors import DataError, UsageError, nearest, shown
 from envs.registry import World
-from experiments.runtime import refuse_existing
+from experiments.runtime import expect_compiling, refuse_existing
 from experiments.store.provenance import provenance, versions
 from experiments.store.settings import CollectConfig, PretrainConfig, dataset_folder
 from experiments.store.work import PIECES, long_work
@@ -327,6 +327,7 @@ def collect_and_save(
         refuse_existing(folder, "remove it", "choose another with --out")
     check_place(folder, num_bytes=config.trajectories * SMALLEST_TRAJECTORY)
     with long_work(folder, asked, provenance(), config.resume, wait, go_on) as work:
+        expect_compiling()
         cpu = time.process_time()
         dataset, facts = collect(
             env, demonstrator, config.trajectories, config.seed, world.num_test_tasks, work.journal

@@ -91,6 +91,19 @@ def cache_folder() -> str:
     return str(home / ".cache" / "mgpo_jax")
 
 
+def expect_compiling() -> None:
+    """Say on stderr that the work begins with compiling, where no compiled programs are kept yet."""
+    try:
+        empty = next(os.scandir(cache_folder()), None) is None
+    except OSError:
+        empty = True
+    if empty:
+        text = (
+            "no compiled programs are kept yet: this begins with compiling, for up to two minutes"
+        )
+        print(text, file=sys.stderr)
+
+
 def run(
     config_class: type,
     main: Callable[[Any], None],

@@ -19,6 +19,7 @@ from envs.errors import DataError, UsageError
 from envs.registry import World
 from experiments.datasets import find_demonstrator, prepare_dataset
 from experiments.figures import training_curve
+from experiments.runtime import expect_compiling
 from experiments.signals import Stopped, asked_to_stop, farewell
 from experiments.store import runs
 from experiments.store.metrics import METRICS, Metrics, check_loggers, salvaged_rows
@@ -297,6 +298,7 @@ def train(config: PretrainConfig, go_on: str = "continue with --resume") -> None
             if runs.is_finished(folder):
                 print(f"{folder} is finished already", file=sys.stderr)
                 return
+        expect_compiling()
         run = Run(config, go_on)
         with checkpoints(run.folder / runs.CHECKPOINTS) as manager:
             blank = run.initial_state()

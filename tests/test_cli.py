@@ -705,3 +705,17 @@ def test_a_continuous_world_from_data_to_release(
     assert code == 1
     assert "was collected by the demonstrator with {'noise': 0.5}" in text
     assert not Path("other").exists()
+
+
+def test_the_first_command_says_that_it_compiles(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("MGPO_CACHE", str(tmp_path / "cache"))
+    runtime.expect_compiling()
+    assert "this begins with compiling" in capsys.readouterr().err
+    (tmp_path / "cache").mkdir()
+    runtime.expect_compiling()
+    assert "this begins with compiling" in capsys.readouterr().err
+    (tmp_path / "cache" / "program").touch()
+    runtime.expect_compiling()
+    assert capsys.readouterr().err == ""
