@@ -113,6 +113,7 @@ KITCHEN = World(
     },
     pictures=load_pictures,
     page=load_page,
+    method_defaults={"spirl": {"target_divergence": 5.0}},  # that of SPiRL's own kitchen
     num_test_tasks=25,
     official=load_official,
 )
