@@ -192,7 +192,6 @@ def counting() -> LowLevel:
         proceed=lambda carry, action, obs: (carry + 1, carry + 1),
         command=lambda carry, decision: 10 * decision,
         act=lambda key, carry, orders, index: (orders + index) % ENV.spec.action_dim,
-        grow=lambda carry, num_steps: carry,
     )
 
 

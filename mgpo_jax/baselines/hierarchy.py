@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from envs.base import Agent, Episode, State, Task, TimeStep
+from envs.base import Agent, Episode, State, Task, TimeStep, keeps_its_size
 from mgpo_jax.adaptation import Adapter
 
 
@@ -44,7 +44,7 @@ class LowLevel(NamedTuple):
     """``(carry, decision) -> orders``: what a decision says for all of its steps."""
     act: Callable[[PRNGKeyArray, Any, Any, Int[Array, ""]], Array]
     """``(key, carry, orders, index) -> action`` in the ``index``-th step after the decision."""
-    grow: Callable[[Any, int], Any]
+    grow: Callable[[Any, int], Any] = keeps_its_size
     """``(carry, num_steps) -> carry`` with room for that many more steps."""
 
 
@@ -115,7 +115,10 @@ def hierarchical(low: LowLevel, decide: Decide, skill_steps: int, horizon: int) 
     def grow(memory: _Memory, num_steps: int) -> _Memory:
         return memory._replace(carry=low.grow(memory.carry, num_steps))
 
-    return Agent(begin, proceed, grow, decisions=lambda memory: memory.kept)
+    # A low level that needs no more room lets the whole episode be one loop.
+    fixed = low.grow is keeps_its_size
+    growing = keeps_its_size if fixed else grow
+    return Agent(begin, proceed, growing, decisions=lambda memory: memory.kept)
 
 
 class Transitions(NamedTuple):

@@ -251,7 +251,6 @@ def low_level(config: SkillConfig, params: Any, judged: Judgement) -> LowLevel:
         proceed=lambda carry, action, obs: see(obs),
         command=command,
         act=act_on,
-        grow=lambda carry, num_steps: carry,
     )
 
 
