@@ -51,7 +51,7 @@ def crafter_pictures(env: Crafter) -> Pictures:
     """What is drawn of Crafter. Where observations are pictures already, they make a video."""
     if env.pixels:
         return Pictures(frame=np.asarray)
-    return Pictures(episodes=draw_episodes, video=write_video, panel=(4.4, 5.4))
+    return Pictures(episodes=draw_episodes, video=write_video, panel=(3.1, 5.2))
 
 
 def draw_episodes(
