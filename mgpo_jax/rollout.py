@@ -33,7 +33,7 @@ def rollout(
 def act(
     key: PRNGKeyArray,
     distribution: Any,
-    greedy: Bool[Array, ""],
+    greedy: bool | Bool[Array, ""],
     temperature: Float[Array, ""] | None = None,
 ) -> Array:
     """An action from a distribution: its mode, or a random one at a temperature."""

@@ -475,6 +475,8 @@ def _run(
     journal holds are not run again. The second result is the CPU time, without compilation.
     """
     state = programs.start.compile(lanes, params)(lanes, params)
+    # A method whose first state holds NaN means something by it.
+    watched = bool(_learns(state.search)) and not fetch(_broken(state.search)).any()
     shared = (params, jnp.int32(0), jnp.int32(0))
     advance = programs.advance.compile((state, lanes), shared)
     done: list[Segment] = []
@@ -494,7 +496,8 @@ def _run(
             log = jax.tree.map(lambda rows, n=num: rows[: grid.size, :n], log)
             judged = jax.tree.map(lambda rows: rows[: grid.size], judged)
             _check_finite(log, judged, grid, before)
-            _check_sound(state.search, grid, before + num)
+            if watched:
+                _check_sound(state.search, grid, before + num)
             done.append(Segment(log, judged, cpu))
             _keep(journal, number, done[-1], state, grid)
             progress.update(num * per_round)
@@ -525,20 +528,21 @@ def _check_finite(log: AdaptLog, judged: Judged, grid: Grid, rounds_before: int)
     )
 
 
+def _learns(searches: Any) -> list[Array]:
+    """The numbers in the states of searches."""
+    leaves = jax.tree.leaves(searches)
+    return [leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)]
+
+
 @jax.jit
 def _broken(searches: Any) -> Bool[Array, "lanes"]:
     """Which searches hold NaN in their states."""
-    numbers = [
-        leaf for leaf in jax.tree.leaves(searches) if jnp.issubdtype(leaf.dtype, jnp.floating)
-    ]
-    found = [jnp.isnan(leaf).reshape(len(leaf), -1).any(axis=1) for leaf in numbers]
+    found = [jnp.isnan(leaf).reshape(len(leaf), -1).any(axis=1) for leaf in _learns(searches)]
     return jnp.any(jnp.stack(found), axis=0)
 
 
 def _check_sound(searches: Any, grid: Grid, rounds: int) -> None:
     """Raise ``DataError`` for the first search whose state holds NaN, such as weights that diverged."""
-    if not any(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in jax.tree.leaves(searches)):
-        return
     if (broken := fetch(_broken(searches))[: grid.size]).any():
         seed, task = divmod(int(np.argmax(broken)) % (grid.seeds * grid.tasks), grid.tasks)
         raise DataError(

@@ -29,6 +29,7 @@ from experiments.store.settings import PretrainConfig, pretrain_default, pretrai
 from mgpo_jax import methods
 from mgpo_jax.dataset import load_dataset
 from mgpo_jax.files import hash_file
+from mgpo_jax.kinds import KINDS
 from mgpo_jax.policy_files import read_policy
 from mgpo_jax.tasks import (
     benchmark_tasks,
@@ -247,7 +248,7 @@ def test_list_names_worlds_and_methods(tmp_path: Path) -> None:
     done = run_python("-m experiments.list", tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     first = {line.split()[0]: line for line in done.stdout.splitlines() if line.startswith("  ")}
-    assert set(first) == {*envs.names(), *methods.names()}
+    assert set(first) == {*envs.names(), *methods.names(), *KINDS.names()}
     assert envs.find("maze15").summary in first["maze15"]
     assert methods.find("bbt").summary in first["bbt"]
     assert all(len(line.split()) > 3 for line in first.values())

@@ -143,13 +143,19 @@ def test_results_of_the_first_version_are_read(tmp_path: Path) -> None:
 def test_published_results_are_read(path: Path) -> None:
     if "kitchen" in path.parts[-3]:
         pytest.importorskip("mujoco")
+    in_crafter = "crafter" in path.parts[-3]
+    if in_crafter:
+        pytest.importorskip("craftax")
     results = load_results(path.parent)
     num = results.returns.shape[1]
-    assert results.optimum_known
+    assert results.optimum_known != in_crafter
     assert results.task_goals.shape[0] == num == len(jax.tree.leaves(results.task_set)[0])
     goals = results.best_goals(0, num - 1)
     if results.method != "bbt":  # which moves the last goal, too
         np.testing.assert_array_equal(goals[-1], results.task_goals[num - 1])
+    if in_crafter:
+        assert results.summary["regret"] is None
+        return
     regret = (results.optimal_returns - results.eval_returns[:, :, -1]).mean()
     assert results.summary["regret"] == pytest.approx(regret, abs=1e-5)
 

@@ -19,6 +19,7 @@ import numpy as np
 
 from experiments.__main__ import COMMANDS
 from mgpo_jax import methods
+from mgpo_jax.kinds import MULTI_GOAL
 
 from .cases import BOTH, USAGE, Case, Expected, pick
 from .grammar_json import NAMES
@@ -264,7 +265,8 @@ def all_flags(command: str) -> list[tuple[Flag, tuple[str, ...]]]:
     """The flags of a command, with the words that have to stand beside them."""
     flags: list[tuple[Flag, tuple[str, ...]]] = [(f, ()) for f in flags_of(config_class(command))]
     if command == "adapt":
-        for name in methods.names():
+        # The policy that is adapted follows prompts: methods of other networks refuse it.
+        for name in (n for n in methods.names() if methods.find(n).policy == MULTI_GOAL):
             words = ("--method", name)
             flags += [(flag, words) for flag in flags_of(methods.find(name).hyper)]
     return flags
