@@ -178,7 +178,7 @@ class ReturnsByItself:
         self._keys = jax.random.split(jax.random.key(EVAL_SEED), num)
 
         def return_of(params: Any, key: PRNGKeyArray, task: Task) -> Array:
-            acting = agent(network, params, env.task_goal(task), world.judged)
+            acting = agent(network, params, world.judged)
             return run_episode(key, env, acting, task).return_
 
         self._returns = together(env, return_of, in_axes=(None, 0, 0))

@@ -39,7 +39,7 @@ class Learned:
         trajectory, summed over its steps; see ``training.bc_loss``.
       complete: ``(config, env, dataset) -> config`` with what comes from the world and its data. Raises
         ``UsageError`` in a world for which there is no such network.
-      agent: ``(config, params, task goal, judged) -> Agent`` whose returns a training watches: what the
+      agent: ``(config, params, judged) -> Agent`` whose returns a training watches: what the
         network does by itself before any method has learned anything. None for the multi-goal policy,
         which is watched under prompts.
       facts: ``(config) -> rows`` of a released network's card, texts by their names; one is ``network``.
@@ -51,7 +51,7 @@ class Learned:
     init: Callable[[Any, Any], Any]
     loss: Callable[..., Any]
     complete: Callable[[Any, Any, Any], Any] = _as_it_is
-    agent: Callable[[Any, Any, Any, Any], Agent] | None = None
+    agent: Callable[[Any, Any, Any], Agent] | None = None
     facts: Callable[[Any], Mapping[str, str]] = lambda config: {"network": "of its own kind"}
     fault: Callable[[Any], str | None] = lambda config: None
 

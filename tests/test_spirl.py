@@ -184,7 +184,7 @@ def test_before_the_first_update_the_prior_acts(params):
     state = agent.init(jax.random.key(0), jnp.zeros(ENV.spec.goal_dim))
     choice, state = agent.adapter().ask(jax.random.key(1), state)
     task = ENV.sample_task(jax.random.key(2))
-    prior = prior_agent(OPEN, params, jnp.zeros(ENV.spec.goal_dim), Judgement())
+    prior = prior_agent(OPEN, params, Judgement())
     for seed in range(3):
         key = jax.random.key(seed)
         mine = run_episode(key, ENV, agent.agent(state, choice), task)

@@ -271,9 +271,8 @@ def log_prior(config: CommandConfig, params: Any, view: View) -> Float[Array, "N
     return jax.nn.log_softmax(network.apply(params, view.features, method="prior_logits"))
 
 
-def prior_agent(config: CommandConfig, params: Any, task_goal: Array, judged: Judgement) -> Agent:
+def prior_agent(config: CommandConfig, params: Any, judged: Judgement) -> Agent:
     """Follows goals drawn from the prior, which knows nothing of the task."""
-    del task_goal
 
     def decide(key: PRNGKeyArray, view: View, state: Any) -> tuple[Array, tuple]:
         del state

@@ -192,18 +192,12 @@ def draw(key: PRNGKeyArray, replay: Replay, num: int) -> tuple[Transitions, Tran
     return drawn, following
 
 
-def reference(agent_of: Callable[[Any], Agent], searching: Any, judged: Any) -> Adapter:
-    """An agent that learns nothing, as an adapter.
-
-    Args:
-      agent_of: ``(choice) -> agent``.
-      searching: the choice of the episodes of the budget.
-      judged: that of the episodes that judge.
-    """
+def reference(agent: Agent, choice: Any) -> Adapter:
+    """An agent that learns nothing, as an adapter whose choice is always the same."""
     return Adapter(
         init=lambda key, task_goal: (),
-        ask=lambda key, state: (searching, state),
-        agent=lambda state, choice: agent_of(choice),
+        ask=lambda key, state: (choice, state),
+        agent=lambda state, choice: agent,
         tell=lambda key, state, choice, episodes: state,
-        best=lambda state: judged,
+        best=lambda state: choice,
     )

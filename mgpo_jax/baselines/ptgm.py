@@ -32,6 +32,7 @@ from mgpo_jax.baselines.commanded import (
     log_prior,
     low_level,
     nearest_command,
+    prior_agent,
 )
 from mgpo_jax.baselines.hierarchy import (
     Mlp,
@@ -211,8 +212,7 @@ def following(setting: Setting, params: Any, rule: Rule) -> Adapter:
         config.skill_steps,
         config.horizon,
     )
-    choice = Choice(jnp.zeros(()))
-    return reference(lambda choice: agent, choice, choice)
+    return reference(agent, Choice(jnp.zeros(())))
 
 
 def make_random(setting: Setting, params: Any, hyper: NoHyper) -> Adapter:
@@ -225,12 +225,8 @@ def make_random(setting: Setting, params: Any, hyper: NoHyper) -> Adapter:
 def make_prior(setting: Setting, params: Any, hyper: NoHyper) -> Adapter:
     """Goals drawn from the prior."""
     del hyper
-    config = setting.network
-    return following(
-        setting,
-        params,
-        lambda key, view, state: jax.random.categorical(key, log_prior(config, params, view)),
-    )
+    agent = prior_agent(setting.network, params, setting.judged)
+    return reference(agent, Choice(jnp.zeros(())))
 
 
 def make_oracle(setting: Setting, params: Any, hyper: NoHyper) -> Adapter:

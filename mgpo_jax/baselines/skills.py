@@ -261,9 +261,8 @@ def prior_of(config: SkillConfig, params: Any, seen: Array) -> Normal:
     return found
 
 
-def prior_agent(config: SkillConfig, params: Any, task_goal: Array, judged: Judgement) -> Agent:
+def prior_agent(config: SkillConfig, params: Any, judged: Judgement) -> Agent:
     """Follows skills drawn from the prior, which knows nothing of the task."""
-    del task_goal
 
     def decide(key: PRNGKeyArray, seen: Array, state: Any) -> tuple[Array, tuple]:
         del state

@@ -37,7 +37,14 @@ from mgpo_jax.baselines.hierarchy import (
     transitions,
 )
 from mgpo_jax.baselines.methods import SpirlHyper
-from mgpo_jax.baselines.skills import Normal, SkillConfig, low_level, normal_of, prior_of
+from mgpo_jax.baselines.skills import (
+    Normal,
+    SkillConfig,
+    low_level,
+    normal_of,
+    prior_agent,
+    prior_of,
+)
 from mgpo_jax.methods import NoHyper, Setting
 from mgpo_jax.trees import choose
 
@@ -206,19 +213,8 @@ def make_spirl(setting: Setting, params: Any, hyper: SpirlHyper) -> Adapter:
 def make_prior(setting: Setting, params: Any, hyper: NoHyper) -> Adapter:
     """Skills drawn from the prior in every episode: what SPiRL starts as."""
     del hyper
-    config: SkillConfig = setting.network
-    low = low_level(config, params, setting.judged)
-
-    def agent_of(choice: Choice) -> Agent:
-        def decide(key: PRNGKeyArray, seen: Array, world: State) -> tuple[Array, tuple]:
-            del world
-            prior = prior_of(config, params, seen)
-            return jnp.where(choice.greedy, prior.mean, prior.sample(key)), ()
-
-        return hierarchical(low, decide, config.skill_steps, config.horizon)
-
-    drawn = Choice(jnp.zeros((), bool))
-    return reference(agent_of, drawn, drawn)
+    agent = prior_agent(setting.network, params, setting.judged)
+    return reference(agent, Choice(jnp.zeros((), bool)))
 
 
 def check_spirl(setting: Setting, hyper: SpirlHyper) -> None:
