@@ -95,6 +95,8 @@ class EnvSpec:
         episode is only a sample of what a prompt is worth.
       reward_confirms_goals: whether a reward at a goal says that this goal was the right one at this
         point, as in worlds that reward a sequence part by part.
+      goals_are_states: whether the goal reached says in which state a task is, as far as a policy can
+        tell states apart. What was seen in several episodes then is one map.
       layout: what the numbers of an observation are, for encoders that embed codes and counts [amounts].
     """
 
@@ -107,6 +109,7 @@ class EnvSpec:
     truncate_in_hindsight: bool = False
     deterministic: bool = True
     reward_confirms_goals: bool = False
+    goals_are_states: bool = False
     layout: ObsLayout | None = None
 
     @property
@@ -212,6 +215,8 @@ class Episode(NamedTuple):
     """Undiscounted sum of the rewards."""
     last_obs: Shaped[Array, "..."]
     """The observation after the last action."""
+    first_goal: Float[Array, "*batch G"] | tuple[()] = ()
+    """The goal that was reached at the start, before any action."""
     failed: Bool[Array, "*batch"] | bool = False
     """Whether the world broke down and ended the episode."""
     decisions: Any = ()

@@ -80,6 +80,7 @@ def run_episode(key: PRNGKeyArray, env: Environment, agent: Agent, task: Task) -
     horizon = env.spec.horizon
     key_reset, key_begin, key_steps = jax.random.split(key, 3)
     state, timestep = env.reset(key_reset, task)
+    first_goal = timestep.achieved_goal
     action, quits, memory = agent.begin(key_begin, task, state, timestep)
     loop = _Loop(
         time=jnp.zeros((), jnp.int32),
@@ -114,6 +115,7 @@ def run_episode(key: PRNGKeyArray, env: Environment, agent: Agent, task: Task) -
         rewards=loop.rewards,
         return_=loop.return_,
         last_obs=loop.last_obs,
+        first_goal=first_goal,
         failed=loop.failed,
         decisions=agent.decisions(loop.memory),
     )

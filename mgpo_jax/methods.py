@@ -230,6 +230,20 @@ class BbtHyper(PromptHyper):
     """Initial step size, in units of goals."""
 
 
+@dataclass(frozen=True)
+class PlanHyper(PromptHyper):
+    """Hyper-parameters of planning in a model of the task (not in the paper)."""
+
+    rehearse: Annotated[int, Ge(0), Le(100)] = static(3)
+    """Rounds of changed prompts that are rehearsed in a search at most; 0 rehearses nothing."""
+    splice: bool = True
+    """Plan in what all episodes have seen; without it in what the best one has."""
+    frontier: bool = True
+    """Explore towards states from where the task goal may be near, too."""
+    num_states: Annotated[int, Ge(1), Le(100_000)] = static(512)
+    """Room for states in the map of the task."""
+
+
 _HERE = "mgpo_jax.optimizers.methods"
 METHODS: Registry[Method] = Registry(
     "method",
@@ -238,7 +252,7 @@ METHODS: Registry[Method] = Registry(
     {
         **{
             name: f"mgpo_jax.methods:{name.upper()}"
-            for name in ("ucb", "bpe", "explore", "grips", "bbt", "gcbc")
+            for name in ("ucb", "bpe", "plan", "explore", "grips", "bbt", "gcbc")
         },
         **{
             name: f"mgpo_jax.baselines.methods:{name.upper().replace('-', '_')}"
@@ -266,6 +280,14 @@ BPE = Method(
     make=f"{_HERE}:make_bpe",
     check=f"{_HERE}:check_prompts",
     hyper=BpeHyper,
+)
+PLAN = Method(
+    name="plan",
+    title="plan",
+    summary="keeps all that it saw as a model of the task, plans in it, and rehearses prompts for the plan",
+    make="mgpo_jax.planning.methods:make_plan",
+    check="mgpo_jax.planning.methods:check_plan",
+    hyper=PlanHyper,
 )
 EXPLORE = Method(
     name="explore",

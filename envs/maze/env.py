@@ -61,6 +61,7 @@ class MazeRunner(Environment):
             horizon=self.horizon,
             return_range=(-STEP_PENALTY * self.horizon, GOAL_REWARD - STEP_PENALTY),
             truncate_in_hindsight=True,
+            goals_are_states=True,
         )
 
     @property

@@ -1,0 +1,173 @@
+"""What was seen of one task, as a table of states: its map.
+
+A state is known by the goal that is reached in it, in worlds where a goal says so much
+(``EnvSpec.goals_are_states``). The table has room for a fixed number of states; when it is full, further
+states are not kept, and what leads to them counts as unknown. All functions are for one task.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray, Shaped
+
+from envs.base import EnvSpec, Episode, Goals
+
+UNKNOWN = -1
+"""Where it is not known what an action leads to, and after the end of a way."""
+FAR = 1_000_000
+"""Steps to a state to which no known way leads."""
+SAME = 1e-4  # goals that differ by less are the same state
+
+
+class Table(NamedTuple):
+    """N rows for states, of which the first ``size`` are taken."""
+
+    goals: Float[Array, "N G"]
+    """The goal that is reached in each state."""
+    obs: Shaped[Array, "N ..."]
+    """What the agent sees there, as it was when it was there first."""
+    successors: Int[Array, "N A"]
+    """The state that each action led to the last time; ``UNKNOWN`` where it was not tried."""
+    visits: Int[Array, "N"]
+    """How often episodes were there."""
+    size: Int[Array, ""]
+    stride: Float[Array, ""]
+    """The largest change of the goal in one step so far, as a sum over its components."""
+
+
+def empty_table(spec: EnvSpec, num_states: int) -> Table:
+    """The table before the first episode in a world with discrete actions."""
+    return Table(
+        goals=jnp.zeros((num_states, spec.goal_dim)),
+        obs=jnp.zeros((num_states, *spec.obs.shape), spec.obs.dtype),
+        successors=jnp.full((num_states, spec.action_dim), UNKNOWN),
+        visits=jnp.zeros(num_states, jnp.int32),
+        size=jnp.int32(0),
+        stride=jnp.float32(0),
+    )
+
+
+def find_state(table: Table, goal: Float[Array, "G"]) -> Int[Array, ""]:
+    """The state in which a goal is reached; ``UNKNOWN`` if it was not seen."""
+    near = jnp.max(jnp.abs(table.goals - goal), axis=-1) < SAME
+    near &= jnp.arange(len(table.goals)) < table.size
+    return jnp.where(jnp.any(near), jnp.argmax(near), UNKNOWN)
+
+
+def add_episode(table: Table, episode: Episode) -> tuple[Table, Int[Array, ""]]:
+    """The table with all steps of an episode, and the state in which it started."""
+    steps = episode.trajectory
+
+    def visit(table: Table, goal: Array, obs: Array) -> tuple[Table, Int[Array, ""]]:
+        found = find_state(table, goal)
+        is_new = (found == UNKNOWN) & (table.size < len(table.goals))
+        row = jnp.where(found == UNKNOWN, jnp.where(is_new, table.size, len(table.goals)), found)
+        table = table._replace(
+            goals=table.goals.at[row].set(goal, mode="drop"),
+            obs=table.obs.at[jnp.where(is_new, row, len(table.goals))].set(obs, mode="drop"),
+            visits=table.visits.at[row].add(1, mode="drop"),
+            size=table.size + is_new,
+        )
+        return table, row
+
+    def step(time: Array, carry: tuple[Table, Array, Array]) -> tuple[Table, Array, Array]:
+        table, before, goal_before = carry
+        goal = steps.achieved_goals[time]
+        after_last = time + 1 >= steps.length
+        next_obs = steps.obs[jnp.minimum(time + 1, len(steps.obs) - 1)]
+        table, row = visit(table, goal, jnp.where(after_last, episode.last_obs, next_obs))
+        known = jnp.where(row < len(table.goals), row, UNKNOWN)
+        successors = table.successors.at[before, steps.actions[time]].set(known, mode="drop")
+        stride = jnp.maximum(table.stride, jnp.sum(jnp.abs(goal - goal_before)))
+        return table._replace(successors=successors, stride=stride), row, goal
+
+    first_goal = jnp.asarray(episode.first_goal)
+    table, start = visit(table, first_goal, steps.obs[0])
+    first = (table, start, first_goal)
+    table, _, _ = jax.lax.fori_loop(0, steps.length, step, first)
+    return table, jnp.where(start < len(table.goals), start, UNKNOWN)
+
+
+def steps_to(table: Table, state: Int[Array, ""]) -> Int[Array, "N"]:
+    """The fewest known steps from each state to one of them; ``FAR`` where no way is known.
+
+    ``UNKNOWN`` is a state that no way leads to.
+    """
+
+    def relax(distance: Array) -> Array:
+        after = jnp.where(table.successors == UNKNOWN, FAR, distance[table.successors])
+        return jnp.minimum(distance, 1 + jnp.min(after, axis=-1)).clip(max=FAR)
+
+    return _settled(relax, _nowhere(table).at[_or_none(table, state)].set(0, mode="drop"))
+
+
+def steps_from(table: Table, state: Int[Array, ""]) -> Int[Array, "N"]:
+    """The fewest known steps from one state to each; ``FAR`` where no way is known."""
+    to = jnp.where(table.successors == UNKNOWN, len(table.goals), table.successors)
+
+    def relax(distance: Array) -> Array:
+        reached = jnp.broadcast_to(1 + distance[:, None], to.shape)
+        return distance.at[to].min(reached, mode="drop")
+
+    return _settled(relax, _nowhere(table).at[_or_none(table, state)].set(0, mode="drop"))
+
+
+def _nowhere(table: Table) -> Int[Array, "N"]:
+    return jnp.full(len(table.goals), FAR)
+
+
+def _or_none(table: Table, state: Int[Array, ""]) -> Int[Array, ""]:
+    """A row to write to, or one that does not exist."""
+    return jnp.where(state == UNKNOWN, len(table.goals), state)
+
+
+def _settled(relax: object, distance: Int[Array, "N"]) -> Int[Array, "N"]:
+    """Distances that ``relax`` changes no further."""
+    first = (distance, jnp.ones((), bool))
+
+    def again(carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        shorter = relax(carry[0])  # type: ignore[operator]
+        return shorter, jnp.any(shorter != carry[0])
+
+    return jax.lax.while_loop(lambda carry: carry[1], again, first)[0]
+
+
+def shortest_way(
+    key: PRNGKeyArray,
+    table: Table,
+    start: Int[Array, ""],
+    left: Int[Array, "N"],
+    longest: int,
+) -> Int[Array, "L"]:
+    """The states after ``start`` on a shortest known way, a random one of several.
+
+    Args:
+      key: random key.
+      table: what is known.
+      start: where the way starts.
+      left: ``steps_to`` the state where it ends.
+      longest: L, the room for the way. One that is longer is cut off.
+
+    Returns:
+      The states, followed by ``UNKNOWN``.
+    """
+
+    def walk(state: Array, key: PRNGKeyArray) -> tuple[Array, Array]:
+        after = table.successors[state]
+        closer = (after != UNKNOWN) & (left[after] < left[state]) & (left[state] < FAR)
+        pick = jnp.argmax(jnp.where(closer, jax.random.uniform(key, after.shape), -1.0))
+        goes_on = (state != UNKNOWN) & jnp.any(closer)
+        state = jnp.where(goes_on, after[pick], UNKNOWN)
+        return state, state
+
+    return jax.lax.scan(walk, start, jax.random.split(key, longest))[1]
+
+
+def goals_on(table: Table, way: Int[Array, "L"]) -> Goals:
+    """The goals that are reached on a way, its end included, in the form that prompts are drawn from."""
+    on_way = way != UNKNOWN
+    goals = jnp.where(on_way[:, None], table.goals[way], 0.0)
+    return Goals(goals, on_way, goals, on_way.sum())
