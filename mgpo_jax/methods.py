@@ -236,6 +236,8 @@ class PlanHyper(PromptHyper):
 
     rehearse: Annotated[int, Ge(0), Le(100)] = static(3)
     """Rounds of changed prompts that are rehearsed in a search at most; 0 rehearses nothing."""
+    steer: Annotated[int, Ge(0), Le(1_000)] = static(20)
+    """Gradient steps by which a search moves goals of prompts towards the planned way; 0 is none."""
     splice: bool = True
     """Plan in what all episodes have seen; without it in what the best one has."""
     frontier: bool = True

@@ -27,6 +27,9 @@ class Policy(NamedTuple):
     """``(carry, num_steps) -> carry`` with room for that many more decodes."""
     num_slots: int
     """P, the number of slots of the prompts that it takes: its longest prompt."""
+    score: Callable | None = None
+    """``(prompt, obs [T, ..], actions [T, ..]) -> action distributions [T]`` of an episode that took these
+    actions, all at once. Prompt optimizers that ask the policy for likelihoods need it."""
 
 
 class LoadedPolicy(NamedTuple):
@@ -80,4 +83,7 @@ def transformer_policy(config: TransformerConfig, params: Any) -> Policy:
     def grow(cache: Any, num_steps: int) -> Any:
         return grow_cache(cache, config.tokens_per_step * num_steps)
 
-    return Policy(prefill, decode, grow, config.max_prompt_length)
+    def score(prompt: Any, obs: Any, actions: Any) -> Any:
+        return network.apply(params, prompt, obs, actions)
+
+    return Policy(prefill, decode, grow, config.max_prompt_length, score)

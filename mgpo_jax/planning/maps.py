@@ -25,12 +25,10 @@ from mgpo_jax.optimizers.arms import (
     Arms,
     empty_arms,
     estimated_returns,
-    insert_arm,
     no_goals,
-    update_arm,
 )
 from mgpo_jax.optimizers.base import PromptOptimizer, SearchSpace
-from mgpo_jax.planning.proposals import changed, random_prompts
+from mgpo_jax.planning.proposals import changed, crossed, random_prompts
 from mgpo_jax.planning.rehearsal import (
     ARRIVES,
     FAILS,
@@ -41,6 +39,7 @@ from mgpo_jax.planning.rehearsal import (
     any_of,
     rehearse,
 )
+from mgpo_jax.planning.steering import Lead, deficits, lead_along, steer
 from mgpo_jax.planning.table import (
     FAR,
     UNKNOWN,
@@ -53,6 +52,7 @@ from mgpo_jax.planning.table import (
     steps_from,
     steps_to,
 )
+from mgpo_jax.planning.trials import is_tried, with_result
 from mgpo_jax.policy import Policy
 from mgpo_jax.prompts import Prompt, sample_prompt, single_goal
 from mgpo_jax.rollout import Query
@@ -62,10 +62,12 @@ NUM_PROMPTS = 32
 """Prompts that are rehearsed together: in each round of changes."""
 NUM_KEPT = 20
 """Of these, those that the next search begins with, beside new random ones."""
-NUM_PARENTS = 8
+NUM_PARENTS = 12
 """The best ones, which are changed."""
+CROSSED = 0.25
+"""Share of changed prompts that have the goals of two parents."""
 SLACK = 12
-"""A rehearsal is given up that many steps after the shortest known way would have arrived."""
+"""A rehearsal is given up when it will take that many steps more than twice the shortest known way."""
 OF_EACH_END = (6, 10, 10)
 """How many prompts that arrive, leave what is known, or fail are kept at least, if there are so many."""
 # What a frontier costs beside the steps over it: for every time that it was chosen before, for every visit
@@ -73,11 +75,21 @@ OF_EACH_END = (6, 10, 10)
 COST_OF_CHOICE, COST_OF_VISIT, MOST_VISITS, CHANCE = 2.0, 0.15, 20, 0.7
 
 
+NUM_LED = 8
+"""Prompts that are steered together."""
+LONGEST_LED = 64
+"""Steps of the longest way that prompts are steered along."""
+MOST_PATIENCE = 16
+"""Episodes after which a search is made again at the latest, where those before found nothing."""
+
+
 class Features(NamedTuple):
     """What the plan makes use of; without one of them it is an ablation."""
 
     rounds: int = 3
     """Rounds of changed prompts that a search rehearses at most; 0 is no rehearsal at all."""
+    steering: int = 20
+    """Gradient steps that a search steers prompts by; 0 is none."""
     splice: bool = True
     """Whether ways are made of all episodes, or of the best one alone."""
     frontier: bool = True
@@ -103,12 +115,16 @@ class MapState(NamedTuple):
     """The goals of the latest episode."""
     kept: Prompt
     """The best prompts of the latest search [NUM_KEPT]."""
+    led: Prompt
+    """The prompts that were steered in the latest search [NUM_LED]."""
     has_kept: Bool[Array, ""]
+    patience: Int[Array, ""]
+    """Episodes between searches, which doubles when one has found nothing."""
+    wait: Int[Array, ""]
+    """Episodes until the next search."""
+    shortest: Int[Array, ""]
+    """Steps of the shortest way that was known at the latest search."""
     num_asked: Int[Array, ""]
-    surprises: Int[Array, ""]
-    """How often a sure prompt did not arrive as rehearsed, in a row."""
-    expected: Int[Array, ""]
-    """The steps that the latest prompt was sure to take; ``FAR`` for one that was not."""
     num_rehearsed: Int[Array, ""]
     """Prompts rehearsed so far."""
 
@@ -125,6 +141,7 @@ class Found(NamedTuple):
     """What a search for prompts has found."""
 
     kept: Prompt
+    led: Prompt
     sure: Offer
     """Arrives sooner than any greedy episode before."""
     hopeful: Offer
@@ -143,25 +160,27 @@ def search_prompts(
     key: PRNGKeyArray,
     state: MapState,
     way: Goals,
+    lead: Lead,
     left: Int[Array, "N"],
     known: Int[Array, ""],
     tools: Tools,
 ) -> Found:
-    """Search for prompts by rehearsing them: the kept ones and random ones, then changed ones.
+    """Search for prompts by rehearsing them: the kept ones and random ones, then changed and steered ones.
 
     Args:
       key: random key.
       state: the plan so far.
       way: the goals on a shortest known way.
+      lead: the same way, as the policy sees it.
       left: ``table.steps_to`` the task goal.
       known: steps of that way.
       tools: what it is made with.
     """
-    limit = jnp.minimum(state.verified - 1, known + SLACK)
+    limit = jnp.minimum(state.verified - 1, 2 * known + SLACK)
     goal = find_state(state.table, state.task_goal)
-    ahead = Ahead(state.table, state.start, goal, limit)
-    key_random, key_rounds = jax.random.split(key)
-    tried = partial(rehearse, tools.world, tools.policy, ahead, left)
+    ahead = Ahead(state.table, state.start, goal, left, limit)
+    key_random, key_rounds, key_led = jax.random.split(key, 3)
+    tried = partial(rehearse, tools.world, tools.policy, ahead)
 
     space = tools.space
     fresh = random_prompts(
@@ -179,40 +198,75 @@ def search_prompts(
     )
     pool = _best(Pool(first, tried(first)))
 
-    def enough(carry: tuple[Array, Pool]) -> Bool[Array, ""]:
+    def child(key: PRNGKeyArray, pool: Pool) -> Prompt:
+        key_parent, key_cross, key_crosses, key_where, key_change = jax.random.split(key, 5)
+        first, second = jax.random.randint(key_parent, (2,), 0, NUM_PARENTS)
+        parent, mate = (
+            jax.tree.map(lambda rows, i=i: rows[i], pool.prompts) for i in (first, second)
+        )
+        mixed = crossed(key_cross, parent, mate, way, space.longest)
+        parent = choose(jax.random.bernoulli(key_crosses, CROSSED), mixed, parent)
+        strays, farthest = pool.rehearsal.strays[first], pool.rehearsal.farthest[first]
+        around = jnp.where(jax.random.bernoulli(key_where), strays, farthest)
+        key_once, key_again, key_more = jax.random.split(key_change, 3)
+        once = changed(key_once, parent, way, space.longest, state.table.stride, around)
+        twice = changed(key_again, once, way, space.longest, state.table.stride, around)
+        return choose(jax.random.bernoulli(key_more), twice, once)
+
+    def lacks_shortest(carry: tuple[Array, Pool]) -> Bool[Array, ""]:
         index, pool = carry
         shortest = (pool.rehearsal.ends[0] == ARRIVES) & (pool.rehearsal.steps[0] <= known)
         return (index < tools.features.rounds) & ~shortest
 
     def change(carry: tuple[Array, Pool]) -> tuple[Array, Pool]:
         index, pool = carry
-        key_parent, key_change = jax.random.split(jax.random.fold_in(key_rounds, index))
-        parents = jax.random.randint(key_parent, (NUM_PROMPTS,), 0, NUM_PARENTS)
-        keys = jax.random.split(key_change, NUM_PROMPTS)
-        children = jax.vmap(
-            lambda key, parent: changed(
-                key,
-                jax.tree.map(lambda rows: rows[parent], pool.prompts),
-                way,
-                space.longest,
-                state.table.stride,
-            )
-        )(keys, parents)
-        both = jax.tree.map(
-            lambda old, new: jnp.concatenate([old, new]), pool, Pool(children, tried(children))
-        )
-        return index + 1, _best(both)
+        keys = jax.random.split(jax.random.fold_in(key_rounds, index), NUM_PROMPTS)
+        children = jax.vmap(lambda key: child(key, pool))(keys)
+        return index + 1, _best(_joined(pool, Pool(children, tried(children))))
 
-    num_rounds, pool = jax.lax.while_loop(enough, change, (jnp.int32(0), pool))
+    num_rounds, pool = jax.lax.while_loop(lacks_shortest, change, (jnp.int32(0), pool))
+    num = NUM_PROMPTS * (1 + num_rounds)
+    led = state.led
+
+    def steered(pool: Pool) -> tuple[Pool, Prompt, Array]:
+        keys = jax.random.split(key_led, NUM_LED)
+        own = jax.vmap(
+            lambda key, parent: changed(
+                key, parent, way, space.longest, state.table.stride, pool.rehearsal.strays[0]
+            )
+        )(keys, led)
+        first = _joined(led, own, _rows(pool.prompts, NUM_LED), _rows(fresh, NUM_LED))
+        chosen = jnp.argsort(deficits(tools.policy, lead, first))[:NUM_LED]
+        first = jax.tree.map(lambda rows: rows[chosen], first)
+        prompts, _ = steer(tools.policy, lead, first, state.table.stride, tools.features.steering)
+        return _best(_joined(pool, Pool(prompts, tried(prompts)))), prompts, jnp.int32(NUM_LED)
+
+    if tools.features.steering and tools.policy.score is not None:
+        needed = lacks_shortest((jnp.int32(-1), pool)) & lead.complete
+        pool, led, more = jax.lax.cond(
+            needed, steered, lambda pool: (pool, led, jnp.int32(0)), pool
+        )
+        num += more
     sooner = pool.rehearsal.steps < state.verified
     if space.deterministic:  # what a prompt did once it would do again
-        sooner &= ~jax.vmap(partial(_was_tried, state.prompts))(pool.prompts)
+        sooner &= ~jax.vmap(partial(is_tried, state.prompts))(pool.prompts)
     return Found(
-        kept=jax.tree.map(lambda rows: rows[:NUM_KEPT], pool.prompts),
+        kept=_rows(pool.prompts, NUM_KEPT),
+        led=led,
         sure=_offer(pool, sooner & (pool.rehearsal.ends == ARRIVES)),
         hopeful=_offer(pool, sooner & (pool.rehearsal.ends == LEAVES)),
-        num_rehearsed=NUM_PROMPTS * (1 + num_rounds),
+        num_rehearsed=num,
     )
+
+
+def _joined(*trees: Any) -> Any:
+    """The rows of several pytrees one after another."""
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *trees)
+
+
+def _rows(tree: Any, num: int) -> Any:
+    """The first rows of a pytree."""
+    return jax.tree.map(lambda rows: rows[:num], tree)
 
 
 def _offer(pool: Pool, which: Bool[Array, "C"]) -> Offer:
@@ -223,12 +277,10 @@ def _offer(pool: Pool, which: Bool[Array, "C"]) -> Offer:
 
 def _best(pool: Pool) -> Pool:
     """The ``NUM_PROMPTS`` best of a pool, each once, with some of each end, the best first."""
-    prompts, rehearsal = pool
+    rehearsal = pool.rehearsal
     num = len(rehearsal.rank)
-    flat = prompts.goals.reshape(num, -1)
-    same = jnp.all(flat[:, None] == flat, axis=-1)
-    same &= jnp.all(prompts.mask[:, None] == prompts.mask, axis=-1)
-    again = jnp.any(jnp.tril(same, -1), axis=-1)
+    # Prompts of the same rank do the same, as far as it matters.
+    again = jnp.any(jnp.tril(rehearsal.rank[:, None] == rehearsal.rank, -1), axis=-1)
     order = jnp.argsort(jnp.where(again, jnp.iinfo(jnp.int32).max, rehearsal.rank))
     pool = jax.tree.map(lambda rows: rows[order], pool)
     ends, again = pool.rehearsal.ends, again[order]
@@ -280,10 +332,12 @@ def plan_map(
             best_return=jnp.float32(-jnp.inf),
             latest=no_goals(space.horizon, goal_dim),
             kept=jax.tree.map(lambda leaf: jnp.stack([leaf] * NUM_KEPT), first),
+            led=jax.tree.map(lambda leaf: jnp.stack([leaf] * NUM_LED), first),
             has_kept=jnp.zeros((), bool),
+            patience=jnp.int32(1),
+            wait=jnp.int32(0),
+            shortest=jnp.int32(FAR),
             num_asked=jnp.int32(0),
-            surprises=jnp.int32(0),
-            expected=jnp.int32(FAR),
             num_rehearsed=jnp.int32(0),
         )
 
@@ -309,21 +363,24 @@ def _next_query(tools: Tools, key: PRNGKeyArray, state: MapState) -> tuple[Query
     goal = find_state(state.table, state.task_goal)
     left = steps_to(state.table, goal)
     known = jnp.where(goal == UNKNOWN, FAR, left[state.start])
-    way = goals_on(
-        state.table, shortest_way(key_way, state.table, state.start, left, space.horizon)
-    )
+    states = shortest_way(key_way, state.table, state.start, left, space.horizon)
+    way = goals_on(state.table, states)
 
     def search() -> Found:
-        return search_prompts(key_search, state, way, left, known, tools)
+        longest = min(space.horizon, LONGEST_LED)
+        lead = lead_along(state.table, state.start, states, longest)
+        return search_prompts(key_search, state, way, lead, left, known, tools)
 
     turn = state.num_asked
-    wanted = (known < state.verified) & (known < FAR) & (state.surprises < 3)
+    may_gain = (known < state.verified) & (known < FAR)
+    wanted = may_gain & ((state.wait == 0) | (known < state.shortest))
+    found = _nothing_found(state)
     if features.rounds:
-        found = _if(wanted, search, _nothing_found(state))
+        result: Found = jax.lax.cond(wanted, search, lambda: found)
+        found = result
     else:
-        found = _nothing_found(state)
         drawn = sample_prompt(key_search, way, state.task_goal, space.num_slots, space.longest)
-        found = found._replace(hopeful=Offer(drawn, known, wanted))
+        found = found._replace(hopeful=Offer(drawn, known, may_gain))
     explores, frontier = explore(key_explore, tools, state, way, known)
     hopes = found.hopeful.exists & (turn % 2 == 0)
     greedy = (turn == 0) | found.sure.exists | hopes
@@ -333,26 +390,27 @@ def _next_query(tools: Tools, key: PRNGKeyArray, state: MapState) -> tuple[Query
         choose(found.sure.exists, found.sure.prompt, choose(hopes, found.hopeful.prompt, explores)),
     )
     chosen = jnp.where(greedy | (frontier == UNKNOWN), len(state.choices), frontier)
+    # A search that finds nothing is made again later and later, until there is something new.
+    patience = jnp.minimum(2 * state.patience, MOST_PATIENCE)
+    patience = jnp.where(found.sure.exists | (known < state.shortest), 1, patience)
     return Query(prompt, greedy), state._replace(
+        patience=jnp.where(wanted, patience, state.patience),
+        wait=jnp.where(wanted, patience - 1, jnp.maximum(state.wait - 1, 0)),
+        shortest=jnp.where(wanted, known, state.shortest),
+        led=found.led,
         choices=state.choices.at[chosen].add(1, mode="drop"),
         kept=found.kept,
         has_kept=state.has_kept | (found.num_rehearsed > 0),
         num_asked=turn + 1,
-        expected=jnp.where(found.sure.exists, found.sure.steps, FAR),
         num_rehearsed=state.num_rehearsed + found.num_rehearsed,
     )
-
-
-def _if(condition: Bool[Array, ""], make: Any, otherwise: Found) -> Found:
-    result: Found = jax.lax.cond(condition, make, lambda: otherwise)
-    return result
 
 
 def _nothing_found(state: MapState) -> Found:
     nothing = Offer(
         jax.tree.map(lambda rows: rows[0], state.kept), jnp.int32(FAR), jnp.zeros((), bool)
     )
-    return Found(state.kept, nothing, nothing, jnp.int32(0))
+    return Found(state.kept, state.led, nothing, nothing, jnp.int32(0))
 
 
 def explore(
@@ -433,15 +491,13 @@ def _told(tools: Tools, state: MapState, query: Query, episode: Episode) -> MapS
     last = steps.length - 1
     arrives = jnp.all(jnp.abs(steps.achieved_goals[last] - state.task_goal) < 1e-4)
     arrived = jnp.where(query.greedy & arrives, steps.length, FAR)
-    surprise = (state.expected < FAR) & (arrived > state.expected)
     return state._replace(
         table=added,
         start=start,
-        prompts=_with_result(state.prompts, query, episode.return_),
+        prompts=with_result(state.prompts, query, episode.return_),
         verified=jnp.minimum(state.verified, arrived),
         best_return=jnp.maximum(state.best_return, episode.return_),
         latest=steps.goals,
-        surprises=jnp.where(surprise, state.surprises + 1, 0),
     )
 
 
@@ -449,21 +505,3 @@ def empty_table_like(table: Table) -> Table:
     """A table of the same room without states."""
     blank = jax.tree.map(jnp.zeros_like, table)
     return blank._replace(successors=jnp.full_like(table.successors, UNKNOWN))
-
-
-def _with_result(prompts: Arms, query: Query, return_: Float[Array, ""]) -> Arms:
-    """The prompts with the result of one that was acted with greedily."""
-    same = _equal(prompts, query.prompt)
-    updated = update_arm(prompts, jnp.argmax(same), return_)
-    told = choose(jnp.any(same), updated, insert_arm(prompts, query.prompt, return_))
-    return choose(query.greedy, told, prompts)
-
-
-def _equal(prompts: Arms, prompt: Prompt) -> Bool[Array, "M"]:
-    """Which prompts of the table are this one."""
-    same = jnp.all(prompts.prompts.goals == prompt.goals, axis=(1, 2))
-    return same & jnp.all(prompts.prompts.mask == prompt.mask, axis=1) & prompts.taken
-
-
-def _was_tried(prompts: Arms, prompt: Prompt) -> Bool[Array, ""]:
-    return jnp.any(_equal(prompts, prompt))

@@ -10,7 +10,7 @@ from envs.base import Goals
 from mgpo_jax.prompts import Prompt, sample_prompt
 
 INSERT, DELETE, REPLACE, DISTURB, SHIFT = range(5)
-FARTHEST_SHIFT = 3
+FARTHEST_SHIFT, FARTHEST_NEAR = 3, 6
 
 
 def random_prompts(
@@ -27,6 +27,26 @@ def random_prompts(
     return jax.vmap(draw)(keys)
 
 
+def crossed(
+    key: PRNGKeyArray, prompt: Prompt, other: Prompt, way: Goals, max_goals: int | Int[Array, ""]
+) -> Prompt:
+    """The goals of one prompt up to a random place on the way, and those of another from there on.
+
+    Where that makes more goals than there may be, the first ones are left out.
+    """
+    num_inner = len(prompt.mask) - 1
+    cut = jax.random.randint(key, (), 0, jnp.maximum(way.length, 1))
+    goals = jnp.concatenate([prompt.goals[:-1], other.goals[:-1]])
+    place = jax.vmap(lambda goal: _nearest(goal, way))(goals)
+    from_first = jnp.arange(len(goals)) < num_inner
+    used = jnp.concatenate([prompt.mask[:-1], other.mask[:-1]])
+    used &= jnp.where(from_first, place < cut, place >= cut)
+    order = jnp.argsort(jnp.where(used, place, -1))[num_inner:]  # unused ones first
+    # One that was used and left out may leave too many of those behind it only if there was no room.
+    has_room = jnp.arange(num_inner) >= num_inner - (max_goals - 1)
+    return _ordered(goals[order], used[order] & has_room, place[order], prompt.goals[-1])
+
+
 # Long because the five changes share what they draw.
 def changed(
     key: PRNGKeyArray,
@@ -34,12 +54,13 @@ def changed(
     way: Goals,
     max_goals: int | Int[Array, ""],
     stride: Float[Array, ""],
+    around: Int[Array, ""],
 ) -> Prompt:
     """A prompt with one change: a goal of the way inserted, one deleted, replaced, disturbed or shifted.
 
     Goals stand in the order of the places on the way that they are nearest to. One is disturbed by normal
-    noise of half a step to two steps, which points beside the way: a policy that cuts a corner can be led
-    around it.
+    noise of half a step to four steps, which points beside the way: a policy that cuts a corner can be led
+    around it. Half of the changes are made near to the place ``around``.
 
     Args:
       key: random key.
@@ -47,24 +68,30 @@ def changed(
       way: goals on a way. The last one, where the way ends, is not inserted.
       max_goals: the longest prompt, the last goal included.
       stride: how far a step changes a goal.
+      around: a place on the way, such as where a rehearsal of the prompt left it.
     """
-    key_op, key_slot, key_place, key_noise, key_size, key_shift = jax.random.split(key, 6)
+    keys = jax.random.split(key, 8)
+    key_op, key_slot, key_place, key_noise, key_size, key_shift, key_near, key_is_near = keys
     inner, used = prompt.goals[:-1], prompt.mask[:-1]
     count, num_inner = used.sum(), jnp.maximum(way.length - 1, 1)
     place = jax.vmap(lambda goal: _nearest(goal, way))(inner)
+    is_near = jax.random.bernoulli(key_is_near)
 
     has_room = count < max_goals - 1
     op = jax.random.randint(key_op, (), 0, 5)
     op = jnp.where((op == INSERT) & ~has_room, REPLACE, op)
     op = jnp.where(count == 0, INSERT, op)
-    slot = jnp.argmax(jnp.where(used, jax.random.uniform(key_slot, used.shape), -1.0))
+    score = jax.random.uniform(key_slot, used.shape)
+    score = jnp.where(is_near, 1 / (1 + jnp.abs(place - around) + 2 * score), score)
+    slot = jnp.argmax(jnp.where(used, score, -1.0))
     slot = jnp.where(op == INSERT, 0, slot)  # the first slot is empty as long as there is room
 
+    near = around + jax.random.randint(key_near, (), -FARTHEST_NEAR, FARTHEST_NEAR + 1)
     anywhere = jax.random.randint(key_place, (), 0, num_inner)
     shift = jax.random.randint(key_shift, (), -FARTHEST_SHIFT, FARTHEST_SHIFT + 1)
-    shifted = jnp.clip(place[slot] + shift, 0, num_inner - 1)
-    to = jnp.where(op == SHIFT, shifted, anywhere)
-    size = stride * jax.random.choice(key_size, jnp.array([0.5, 1.0, 2.0]))
+    to = jnp.where(op == SHIFT, place[slot] + shift, jnp.where(is_near, near, anywhere))
+    to = jnp.clip(to, 0, num_inner - 1)
+    size = stride * jax.random.choice(key_size, jnp.array([0.5, 1.0, 2.0, 4.0]))
     noise = size * jax.random.normal(key_noise, inner.shape[-1:])
     goal = jnp.where(op == DISTURB, inner[slot] + noise, way.achieved_goals[to])
 

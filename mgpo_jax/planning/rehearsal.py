@@ -22,7 +22,7 @@ from mgpo_jax.rollout import Query, rollout
 HOPE = 2
 """Steps that a way beyond what is known is taken to cost, beside those that are known to be left."""
 TOGETHER = 8  # rehearsals that share a clock: their memories fit into the cache near a core
-# Ranks put the expected steps first, then how near to the goal it came, then how long it held out.
+# Ranks put the expected steps first, then what is left, then how long it kept to a shortest way.
 _DIGITS = 1024
 
 ARRIVES, LEAVES, FAILS = range(3)
@@ -34,8 +34,10 @@ class Ahead(NamedTuple):
     table: Table
     start: Int[Array, ""]
     goal: Int[Array, ""]
+    left: Int[Array, "N"]
+    """The fewest known steps from each state to the goal (``table.steps_to``)."""
     limit: Int[Array, ""]
-    """Steps after which a rehearsal is given up."""
+    """A rehearsal is given up where it has no known way left to arrive after so many steps in all."""
 
 
 class Place(NamedTuple):
@@ -84,7 +86,7 @@ class Seen(Environment):
             outcome=number,
             reward=jnp.zeros(()),
             terminated=(place.state == UNKNOWN) | (place.state == ahead.goal),
-            truncated=place.steps >= ahead.limit,
+            truncated=place.steps + ahead.left[place.state] > ahead.limit,
         )
 
 
@@ -97,19 +99,21 @@ class Rehearsal(NamedTuple):
     """Until it arrives, for sure; where it leaves what is known, the steps that may be hoped for; ``FAR``
     where it fails."""
     rank: Int[Array, "*C"]
-    """The lower, the better; with ties broken by how near to the goal it came."""
+    """The lower, the better. Ties in steps are broken by what was left to go at the best moment, where
+    every step beside a shortest way counts as one more, and then by ``strays``."""
+    strays: Int[Array, "*C"]
+    """After how many steps it left the shortest ways."""
+    farthest: Int[Array, "*C"]
+    """How many steps of a shortest way it had behind it at the best moment."""
 
 
-def rehearse(
-    world: Seen, policy: Policy, ahead: Ahead, left: Int[Array, "N"], prompts: Prompt
-) -> Rehearsal:
+def rehearse(world: Seen, policy: Policy, ahead: Ahead, prompts: Prompt) -> Rehearsal:
     """Try prompts [C] greedily in the table.
 
     Args:
       world: the world as far as it was seen.
       policy: who acts.
       ahead: what to try.
-      left: ``table.steps_to`` the goal.
       prompts: the C prompts.
     """
     greedy = jnp.ones((), bool)
@@ -117,31 +121,34 @@ def rehearse(
     def tried(prompt: Prompt) -> Rehearsal:
         episode = rollout(jax.random.key(0), world, policy, ahead, Query(prompt, greedy))
         steps = episode.trajectory
-        return _judged(steps.achieved_goals[:, 0].astype(jnp.int32), steps.length, ahead, left)
+        return _judged(steps.achieved_goals[:, 0].astype(jnp.int32), steps.length, ahead)
 
     return jax.lax.map(tried, prompts, batch_size=TOGETHER)
 
 
-def _judged(
-    way: Int[Array, "T"], length: Int[Array, ""], ahead: Ahead, left: Int[Array, "N"]
-) -> Rehearsal:
+def _judged(way: Int[Array, "T"], length: Int[Array, ""], ahead: Ahead) -> Rehearsal:
     """What a rehearsal came to that visited the states ``way`` after its start."""
     states = jnp.concatenate([ahead.start[None], way])
-    known = (jnp.arange(len(states)) <= length) & (states != UNKNOWN)
-    last = jnp.sum(known) - 1  # steps that are known
-    remain = jnp.minimum(left[states], _DIGITS // 2)
-    total = jnp.where(known, jnp.arange(len(states)) + remain, FAR)
-    nearest = jnp.min(total)
-    held = jnp.max(jnp.where(known & (total == nearest), jnp.arange(len(states)), 0))
+    steps = jnp.arange(len(states))
+    known = (steps <= length) & (states != UNKNOWN)
+    left = jnp.minimum(ahead.left[states], _DIGITS // 4)
+    last = jnp.sum(known) - 1
     arrives = states[last] == ahead.goal
     leaves = ~arrives & (states[length] == UNKNOWN)
-    steps = jnp.where(arrives, last, jnp.where(leaves, last + 1 + remain[states[last]] + HOPE, FAR))
-    first = jnp.minimum(steps, _DIGITS - 1)
-    rank = (first * _DIGITS + jnp.minimum(nearest, _DIGITS - 1)) * _DIGITS + _DIGITS - 1 - held
+    hoped = last + 1 + left[last] + HOPE
+    total = jnp.where(arrives, last, jnp.where(leaves, hoped, FAR))
+
+    beside = steps + left - left[0]  # steps that did not lead nearer
+    to_go = jnp.where(known, left + beside, FAR)
+    moment = jnp.argmin(to_go)
+    strays = jnp.max(jnp.where(known & (beside == 0), steps, 0))
+    first, second = (jnp.clip(number, 0, _DIGITS - 1) for number in (total, to_go[moment]))
     return Rehearsal(
         ends=jnp.where(arrives, ARRIVES, jnp.where(leaves, LEAVES, FAILS)),
-        steps=steps,
-        rank=rank,
+        steps=total,
+        rank=(first * _DIGITS + second) * _DIGITS + _DIGITS - 1 - strays,
+        strays=strays,
+        farthest=left[0] - left[moment],
     )
 
 

@@ -1,0 +1,342 @@
+"""The plan where rewards confirm goals: what is known of the order that a task wants, what is ruled out.
+
+In worlds that reward a sequence part by part (``EnvSpec.reward_confirms_goals``), the longest sequence of
+rewarded goals so far is how the order begins, and the goal that followed it unrewarded is not the next. A
+prompt names what is confirmed, then a goal that may be next, then the others in a random order. Once an
+episode earns all, the order is known, and what is left is to find a prompt under which the policy follows
+it: the whole order, without one of its goals, or with goals that are moved a little.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from envs.base import Episode
+from mgpo_jax.optimizers.arms import Arms, empty_arms, estimated_returns
+from mgpo_jax.optimizers.base import PromptOptimizer, SearchSpace
+from mgpo_jax.planning.trials import is_tried, with_result
+from mgpo_jax.prompts import Prompt, single_goal
+from mgpo_jax.rollout import Query
+from mgpo_jax.trees import choose
+
+MAX_GOALS = 64
+"""Room for different goals; further ones are not kept."""
+NONE = -1
+SAME = 1e-4  # goals that differ by less are the same
+ENOUGH = 1e-4  # a return this near to the largest one is the largest
+MOVED = 0.1
+"""Standard deviation of the smallest noise on the goals of a known order; the largest is three times it."""
+# Returns that the whole order, and the order without one of its goals, are expected to have beforehand, and
+# how many episodes that expectation is worth; the spread of returns in a world of chance.
+PRIOR_WHOLE, PRIOR_WITHOUT, PRIOR_WEIGHT, SPREAD = 0.9, 0.6, 2.0, 0.25
+
+
+class Order(NamedTuple):
+    """What is known of the order, for M goals that were reached."""
+
+    goals: Float[Array, "M G"]
+    reached: Float[Array, "M"]
+    """How often each was reached."""
+    size: Int[Array, ""]
+    prefix: Int[Array, "W"]
+    """The goals that the order begins with, ``NONE`` after the last one that is confirmed."""
+    excluded: Bool[Array, "M"]
+    """Those that are not the next after the prefix."""
+    tried: Float[Array, "M"]
+    """How often each was tried as the next after the prefix."""
+    complete: Bool[Array, ""]
+    """Whether an episode earned all with this prefix, which then is the order."""
+
+    @property
+    def length(self) -> Int[Array, ""]:
+        """Number of confirmed goals."""
+        return jnp.sum(self.prefix != NONE)
+
+    @property
+    def confirmed(self) -> Bool[Array, "M"]:
+        """Which goals are in the prefix."""
+        numbers = jnp.arange(len(self.goals))
+        return jnp.any(self.prefix[:, None] == numbers, axis=0)
+
+
+def no_order(num_places: int, goal_dim: int) -> Order:
+    """Nothing known, with room for an order of ``num_places`` goals."""
+    nothing = jnp.zeros(MAX_GOALS)
+    return Order(
+        goals=jnp.zeros((MAX_GOALS, goal_dim)),
+        reached=nothing,
+        size=jnp.int32(0),
+        prefix=jnp.full(num_places, NONE),
+        excluded=jnp.zeros(MAX_GOALS, bool),
+        tried=nothing,
+        complete=jnp.zeros((), bool),
+    )
+
+
+def observe(order: Order, episode: Episode, largest_return: float) -> Order:
+    """What is known of the order after an episode.
+
+    A reward without a goal reached, such as for a mistake that was undone, confirms only what came before.
+    """
+    steps = episode.trajectory
+    time = jnp.arange(len(steps.goal_reached))
+    real = time < steps.length
+    events = steps.goal_reached & real
+    odd = real & (episode.rewards > 0) & ~steps.goal_reached
+    clean = ~jnp.any(odd)
+    until = jnp.where(clean, len(time), jnp.argmax(odd))
+
+    order, numbers = _registered(order, steps.achieved_goals, events)
+    certain = events & (time < until)
+    rewarded = certain & (episode.rewards > 0)
+    num = jnp.sum(rewarded)
+    last = jnp.max(jnp.where(rewarded, time, -1))
+    later = certain & (time > last)
+    wrong = jnp.where(jnp.any(later) & clean, numbers[jnp.argmax(later)], NONE)
+
+    longer = num > order.length
+    place = jnp.where(rewarded, jnp.cumsum(rewarded) - 1, len(order.prefix))
+    prefix = jnp.full_like(order.prefix, NONE).at[place].set(numbers, mode="drop")
+    order = order._replace(
+        prefix=jnp.where(longer, prefix, order.prefix),
+        excluded=order.excluded & ~longer,
+        tried=jnp.where(longer, 0.0, order.tried),
+    )
+    rules_out = (num == order.length) & (wrong != NONE)
+    row = jnp.where(rules_out, wrong, MAX_GOALS)
+    return order._replace(
+        excluded=order.excluded.at[row].set(True, mode="drop"),
+        complete=order.complete | (clean & (episode.return_ > largest_return - ENOUGH)),
+    )
+
+
+def _registered(
+    order: Order, goals: Float[Array, "T G"], events: Bool[Array, "T"]
+) -> tuple[Order, Int[Array, "T"]]:
+    """The order with the goals that were reached, and the number of each event's goal."""
+
+    def register(order: Order, row: tuple[Array, Array]) -> tuple[Order, Array]:
+        goal, happens = row
+        same = jnp.max(jnp.abs(order.goals - goal), axis=-1) < SAME
+        same &= jnp.arange(MAX_GOALS) < order.size
+        is_new = happens & ~jnp.any(same) & (order.size < MAX_GOALS)
+        number = jnp.where(jnp.any(same), jnp.argmax(same), jnp.where(is_new, order.size, NONE))
+        number = jnp.where(happens, number, NONE)
+        at = jnp.where(number == NONE, MAX_GOALS, number)
+        order = order._replace(
+            goals=order.goals.at[at].set(goal, mode="drop"),
+            reached=order.reached.at[at].add(1.0, mode="drop"),
+            size=order.size + is_new,
+        )
+        return order, number
+
+    return jax.lax.scan(register, order, (goals, events))
+
+
+def next_goal(key: PRNGKeyArray, order: Order) -> Int[Array, ""]:
+    """The goal to try after the prefix: rather one that is often reached and was seldom tried.
+
+    Returns ``NONE`` where no goal is left.
+    """
+    rest = (jnp.arange(MAX_GOALS) < order.size) & ~order.confirmed
+    possible = rest & ~order.excluded
+    allowed = jnp.where(jnp.any(possible), possible, rest)
+    weight = jnp.sqrt(order.reached) / (1 + order.tried)
+    scores = jnp.log(jnp.maximum(weight, 1e-9)) + jax.random.gumbel(key, weight.shape)
+    return jnp.where(jnp.any(rest), jnp.argmax(jnp.where(allowed, scores, -jnp.inf)), NONE)
+
+
+def plan_prompt(
+    key: PRNGKeyArray,
+    order: Order,
+    first: Int[Array, ""],
+    task_goal: Float[Array, "G"],
+    num_slots: int,
+    max_goals: int | Int[Array, ""],
+) -> Prompt:
+    """What is confirmed, then ``first``, then the other goals in a random order, and the task goal."""
+    num_inner = num_slots - 1
+    numbers = jnp.arange(MAX_GOALS)
+    others = (numbers < order.size) & ~order.confirmed & (numbers != first)
+    scores = 0.5 * jnp.log(jnp.maximum(order.reached, 1e-9))
+    scores += jax.random.gumbel(key, scores.shape)
+    drawn = jnp.argsort(-jnp.where(others, scores, -jnp.inf))
+    place, length = jnp.arange(num_inner), order.length
+    has_first = first != NONE
+    after = jnp.clip(place - length - has_first, 0, MAX_GOALS - 1)
+    sequence = jnp.where(
+        place < length,
+        order.prefix[jnp.minimum(place, len(order.prefix) - 1)],
+        jnp.where((place == length) & has_first, first, drawn[after]),
+    )
+    count = length + has_first + jnp.sum(others)
+    return _right_aligned(order, sequence, count, task_goal, max_goals)
+
+
+def _right_aligned(
+    order: Order,
+    sequence: Int[Array, "W"],
+    count: Int[Array, ""],
+    task_goal: Float[Array, "G"],
+    max_goals: int | Int[Array, ""],
+) -> Prompt:
+    """The prompt of the first ``count`` goals of a sequence, as far as there is room."""
+    num_inner = len(sequence)
+    count = jnp.minimum(count, jnp.minimum(num_inner, max_goals - 1))
+    place = jnp.arange(num_inner) - (num_inner - count)
+    mask = jnp.append(place >= 0, True)
+    inner = order.goals[sequence[jnp.maximum(place, 0)]] if num_inner else order.goals[:0]
+    goals = jnp.concatenate([inner, task_goal[None]])
+    return Prompt(jnp.where(mask[:, None], goals, 0.0), mask)
+
+
+def without(prompt: Prompt, slot: Int[Array, ""]) -> Prompt:
+    """The prompt without the goal in one of its slots; a slot that is empty changes nothing."""
+    places = jnp.arange(len(prompt.mask))
+    source = jnp.where(places <= slot, places - 1, places)
+    mask = prompt.mask[source] & (source >= 0)
+    mask = jnp.where(prompt.mask[slot], mask, prompt.mask)
+    goals = jnp.where(prompt.mask[slot], prompt.goals[source], prompt.goals)
+    return Prompt(jnp.where(mask[:, None], goals, 0.0), mask)
+
+
+class OrderState(NamedTuple):
+    """The plan between two episodes."""
+
+    task_goal: Float[Array, "G"]
+    order: Order
+    first: Int[Array, ""]
+    """The goal that the latest prompt tried as the next; ``NONE`` for none."""
+    planned: Prompt
+    """What is planned for the next episode, as long as the order is not complete."""
+    planned_first: Int[Array, ""]
+    prompts: Arms
+    """The prompts that were acted with greedily, with their returns."""
+    variant: Int[Array, ""]
+    """Which variant of the complete order the latest prompt was; ``NONE`` for none. 0 is the whole order, i
+    the order without the goal in slot i - 1."""
+    pulls: Float[Array, "V"]
+    """Episodes of each variant."""
+    earned: Float[Array, "V"]
+    """The sum of their returns."""
+    num_variants: Int[Array, ""]
+    """Variants tried, those with moved goals included."""
+    num_asked: Int[Array, ""]
+
+
+# Long because the four functions of an optimizer share its settings and are read together.
+def plan_order(space: SearchSpace) -> PromptOptimizer:
+    """The plan in a world whose rewards confirm goals."""
+    num_slots, largest = space.num_slots, space.return_range[1]
+    longest = space.longest
+
+    def init(key: PRNGKeyArray, task_goal: Float[Array, "G"]) -> OrderState:
+        del key
+        goal_dim = task_goal.shape[-1]
+        return OrderState(
+            task_goal=task_goal,
+            order=no_order(max(num_slots - 1, 1), goal_dim),
+            first=jnp.int32(NONE),
+            planned=single_goal(task_goal, num_slots),
+            planned_first=jnp.int32(NONE),
+            prompts=empty_arms(min(64, space.num_episodes), num_slots, goal_dim),
+            variant=jnp.int32(NONE),
+            pulls=jnp.zeros(num_slots),
+            earned=jnp.zeros(num_slots),
+            num_variants=jnp.int32(0),
+            num_asked=jnp.int32(0),
+        )
+
+    def whole(state: OrderState) -> Prompt:
+        """The prompt of the complete order."""
+        sequence = state.order.prefix[: num_slots - 1]
+        return _right_aligned(state.order, sequence, state.order.length, state.task_goal, longest)
+
+    def variant_of(state: OrderState, index: Int[Array, ""]) -> Prompt:
+        prompt = whole(state)
+        return choose(index == 0, prompt, without(prompt, jnp.maximum(index - 1, 0)))
+
+    def possible(state: OrderState) -> Bool[Array, "V"]:
+        """Which variants there are: the whole order, and one without each of its goals."""
+        return jnp.append(True, whole(state).mask[:-1])
+
+    def estimates(state: OrderState) -> Float[Array, "V"]:
+        prior = jnp.full(num_slots, PRIOR_WITHOUT).at[0].set(PRIOR_WHOLE)
+        mean = (state.earned + PRIOR_WEIGHT * prior) / (state.pulls + PRIOR_WEIGHT)
+        return jnp.where(possible(state), mean, -jnp.inf)
+
+    def next_variant(key: PRNGKeyArray, state: OrderState) -> tuple[Prompt, Array]:
+        """The variant of the complete order to act with, and its number."""
+        if not space.deterministic:
+            spread = SPREAD / jnp.sqrt(state.pulls + PRIOR_WEIGHT)
+            drawn = estimates(state) + spread * jax.random.normal(key, spread.shape)
+            index = jnp.argmax(drawn)
+            return variant_of(state, index), index
+        # The greedy episode of each variant is the same every time, so each is tried once.
+        left = jnp.sort(jnp.where(possible(state), jnp.arange(num_slots), num_slots))
+        index = left[jnp.minimum(state.num_variants, num_slots - 1)]
+        is_moved = (index == num_slots) | (state.num_variants >= num_slots)
+        moved = moved_goals(key, whole(state))
+        prompt = choose(is_moved, moved, variant_of(state, jnp.minimum(index, num_slots - 1)))
+        solved = jnp.max(state.prompts.entry_return) > largest - ENOUGH
+        return choose(solved, best_tried(state), prompt), jnp.int32(NONE)
+
+    def best_tried(state: OrderState) -> Prompt:
+        index = jnp.argmax(estimated_returns(state.prompts, space.deterministic))
+        return state.prompts.prompt(index)
+
+    def ask(key: PRNGKeyArray, state: OrderState) -> tuple[Query, OrderState]:
+        prompt, variant = next_variant(key, state)
+        complete = state.order.complete
+        prompt = choose(complete, prompt, state.planned)
+        again = is_tried(state.prompts, prompt) & space.deterministic
+        greedy = complete | ~again  # once more, it would show nothing new
+        return Query(prompt, greedy), state._replace(
+            first=jnp.where(complete, NONE, state.planned_first),
+            variant=jnp.where(complete, variant, NONE),
+            num_variants=state.num_variants + complete,
+            num_asked=state.num_asked + 1,
+        )
+
+    def tell(state: OrderState, query: Query, episode: Episode) -> OrderState:
+        order = observe(state.order, episode, largest)
+        # What it was tried after is the prefix before this episode.
+        same = order.length == state.order.length
+        row = jnp.where(same & (state.first != NONE), state.first, MAX_GOALS)
+        order = order._replace(tried=order.tried.at[row].add(1.0, mode="drop"))
+        variant = jnp.where(state.variant == NONE, len(state.pulls), state.variant)
+        key = jax.random.fold_in(jax.random.key(0), state.num_asked)
+        key = jax.random.fold_in(key, jnp.sum(episode.trajectory.length))
+        key_first, key_rest = jax.random.split(key)
+        first = next_goal(key_first, order)
+        return state._replace(
+            order=order,
+            planned=plan_prompt(key_rest, order, first, state.task_goal, num_slots, longest),
+            planned_first=first,
+            prompts=with_result(state.prompts, query, episode.return_),
+            pulls=state.pulls.at[variant].add(1.0, mode="drop"),
+            earned=state.earned.at[variant].add(episode.return_, mode="drop"),
+        )
+
+    def best(state: OrderState) -> Prompt:
+        tried = choose(state.prompts.size == 0, state.planned, best_tried(state))
+        if space.deterministic:
+            return tried
+        return choose(
+            state.order.complete, variant_of(state, jnp.argmax(estimates(state))), state.planned
+        )
+
+    return PromptOptimizer(init, ask, tell, best)
+
+
+def moved_goals(key: PRNGKeyArray, prompt: Prompt) -> Prompt:
+    """The prompt with noise on all its goals but the last."""
+    key_size, key_noise = jax.random.split(key)
+    size = MOVED * jax.random.randint(key_size, (), 1, 4)
+    noise = size * jax.random.normal(key_noise, prompt.goals.shape)
+    inner = prompt.mask.at[-1].set(False)
+    return prompt._replace(goals=prompt.goals + jnp.where(inner[:, None], noise, 0.0))

@@ -1,0 +1,423 @@
+"""The plan: its map against networkx, rehearsals against episodes, orders against a hand-made task."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import networkx as nx
+import numpy as np
+import pytest
+
+from envs.base import Episode, Goals, Trajectory
+from envs.maze.env import MazeRunner, MazeTask
+from mgpo_jax.adaptation import search
+from mgpo_jax.distributions import Categorical
+from mgpo_jax.optimizers.base import SearchSpace
+from mgpo_jax.optimizers.methods import prompt_adapter
+from mgpo_jax.planning.maps import Features, plan_map
+from mgpo_jax.planning.orders import NONE, moved_goals, plan_order, without
+from mgpo_jax.planning.proposals import changed, random_prompts
+from mgpo_jax.planning.rehearsal import ARRIVES, LEAVES, Ahead, Seen, rehearse
+from mgpo_jax.planning.table import (
+    FAR,
+    UNKNOWN,
+    add_episode,
+    empty_table,
+    find_state,
+    goals_on,
+    shortest_way,
+    steps_from,
+    steps_to,
+)
+from mgpo_jax.policy import Policy
+from mgpo_jax.prompts import goals_of, prompt_of, single_goal
+from mgpo_jax.rollout import Query, rollout
+
+SIDE, NUM_SLOTS = 9, 5
+WORLD = MazeRunner(name="small", side=SIDE, horizon=40)
+
+
+def compass(num_slots: int = NUM_SLOTS, sharpness: float = 4.0) -> Policy:
+    """A policy that needs no training: it steps towards the first goal of its prompt that it has not
+    reached, and only where the way is free. It gets stuck in dead ends, so that prompts matter."""
+    moves = jnp.array([(0, -1), (-1, 0), (0, 1), (1, 0)]) / SIDE
+
+    def decide(prompt, slot, obs):
+        here, free = obs[:2], obs[2:6] > 0
+        reached = jnp.all(jnp.abs(prompt.goals[slot] - here) < 1e-3)
+        slot = jnp.minimum(slot + reached, num_slots - 1)
+        distance = jnp.sum(jnp.abs(here + moves - prompt.goals[slot]), axis=-1)
+        logits = -sharpness * SIDE * distance + jnp.where(free, 0.0, -100.0)
+        return Categorical(jnp.append(logits, -200.0)), slot
+
+    def prefill(prompt, obs):
+        distribution, slot = decide(prompt, jnp.argmax(prompt.mask), obs)
+        return distribution, (prompt, slot)
+
+    def decode(carry, action, obs):
+        prompt, slot = carry
+        distribution, slot = decide(prompt, slot, obs)
+        return distribution, (prompt, slot)
+
+    return Policy(prefill, decode, lambda carry, num_steps: carry, num_slots)
+
+
+POLICY = compass()
+
+
+@pytest.fixture(scope="module")
+def tasks():
+    return jax.vmap(WORLD.sample_task)(jax.random.split(jax.random.key(3), 12))
+
+
+def task_at(tasks, index):
+    return jax.tree.map(lambda leaf: leaf[index], tasks)
+
+
+@jax.jit
+def explored(key, task):
+    """Five episodes of random actions under random prompts, and the table of them."""
+
+    def another(table, key):
+        key_goals, key_run = jax.random.split(key)
+        goals = jax.vmap(WORLD.sample_goal)(jax.random.split(key_goals, NUM_SLOTS - 1))
+        prompt = single_goal(WORLD.task_goal(task), NUM_SLOTS)
+        prompt = prompt._replace(
+            goals=prompt.goals.at[:-1].set(goals), mask=jnp.ones(NUM_SLOTS, bool)
+        )
+        query = Query(prompt, jnp.zeros((), bool))
+        episode = rollout(key_run, WORLD, compass(sharpness=0.3), task, query)
+        table, start = add_episode(table, episode)
+        return table, (episode, start)
+
+    first = empty_table(WORLD.spec, 100)
+    return jax.lax.scan(another, first, jax.random.split(key, 5))
+
+
+def graph_of(episodes):
+    """The same as a networkx graph: states are goals, edges what was walked."""
+    graph = nx.DiGraph()
+    for first, goals, length in zip(
+        np.asarray(episodes.first_goal),
+        np.asarray(episodes.trajectory.achieved_goals),
+        np.asarray(episodes.trajectory.length),
+        strict=True,
+    ):
+        way = [tuple(np.round(row, 4)) for row in (first, *goals[:length])]
+        nx.add_path(graph, way)
+    return graph
+
+
+@pytest.mark.parametrize("index", range(4))
+def test_known_ways_are_those_of_the_union_of_all_episodes(tasks, index):
+    table, (episodes, starts) = explored(jax.random.key(index), task_at(tasks, index))
+    graph = graph_of(episodes)
+    names = [tuple(np.round(row, 4)) for row in np.asarray(table.goals)[: int(table.size)]]
+    assert set(names) == set(graph)
+    assert len(set(np.asarray(starts).tolist())) == 1
+    start = int(starts[0])
+    after = np.asarray(steps_from(table, starts[0]))
+    wanted = nx.single_source_shortest_path_length(graph, names[start])
+    assert {name: int(after[i]) for i, name in enumerate(names) if after[i] < FAR} == wanted
+    for end in (0, len(names) - 1):
+        before = np.asarray(steps_to(table, jnp.int32(end)))
+        wanted = nx.single_target_shortest_path_length(graph, names[end])
+        assert {n: int(before[i]) for i, n in enumerate(names) if before[i] < FAR} == dict(wanted)
+        way = shortest_way(jax.random.key(0), table, starts[0], steps_to(table, jnp.int32(end)), 40)
+        walked = [start, *[int(i) for i in way if i != UNKNOWN]]
+        assert walked[-1] == end and len(walked) - 1 == int(after[end])
+        assert all(
+            graph.has_edge(names[a], names[b])
+            for a, b in zip(walked, walked[1:], strict=False)
+            if a != b
+        )
+
+
+def test_a_hand_drawn_way_is_spliced_from_two_episodes():
+    # One episode goes 0, 1, 2 and another 1, 3; nobody ever went from 0 to 3.
+    def walk(goals, actions):
+        rows = jnp.array(goals[1:], jnp.float32)[:, None]
+        num = len(actions)
+        steps = Trajectory(
+            obs=jnp.array(goals[:-1], jnp.float32)[:, None],
+            actions=jnp.array(actions),
+            achieved_goals=rows,
+            goal_reached=jnp.ones(num, bool),
+            outcomes=rows,
+            length=jnp.int32(num),
+        )
+        last, first = rows[-1], jnp.array([float(goals[0])])
+        return Episode(steps, jnp.zeros(num), jnp.float32(0), last, first)
+
+    spec = WORLD.spec
+    table = empty_table(spec, 10)._replace(goals=jnp.zeros((10, 1)), obs=jnp.zeros((10, 1)))
+    table, start = add_episode(table, walk([0, 1, 2], [2, 2]))
+    table, other = add_episode(table, walk([1, 3], [4]))
+    assert (int(start), int(other), int(table.size)) == (0, 1, 4)
+    goal = find_state(table, jnp.array([3.0]))
+    left = steps_to(table, goal)
+    assert left[:4].tolist() == [2, 1, FAR, 0]
+    way = shortest_way(jax.random.key(0), table, start, left, 5)
+    assert way.tolist() == [1, 3, UNKNOWN, UNKNOWN, UNKNOWN]
+    assert goals_on(table, way).achieved_goals[:2, 0].tolist() == [1.0, 3.0]
+    assert table.stride == 2.0
+
+
+def test_a_full_table_keeps_what_it_has():
+    task = MazeTask(jnp.zeros((SIDE, SIDE), jnp.int32), jnp.array([1, 1]))
+    prompt = single_goal(WORLD.task_goal(task), NUM_SLOTS)
+    episode = rollout(jax.random.key(0), WORLD, POLICY, task, Query(prompt, jnp.ones((), bool)))
+    assert episode.trajectory.length > 5
+    table, start = add_episode(empty_table(WORLD.spec, 4), episode)
+    assert (int(start), int(table.size)) == (0, 4)
+    assert find_state(table, WORLD.task_goal(task)) == UNKNOWN
+    assert int(jnp.max(table.successors)) == 3
+    assert int(steps_from(table, start)[3]) == 3
+
+
+@pytest.mark.parametrize("index", range(6))
+def test_what_a_rehearsal_calls_sure_an_episode_does(tasks, index):
+    task = task_at(tasks, index)
+    table, (_, starts) = explored(jax.random.key(index), task)
+    goal = find_state(table, WORLD.task_goal(task))
+    end = jnp.where(goal == UNKNOWN, table.size - 1, goal)
+    left = steps_to(table, end)
+    way = goals_on(table, shortest_way(jax.random.key(1), table, starts[0], left, 40))
+    prompts = random_prompts(jax.random.key(index), way, table.goals[end], NUM_SLOTS, NUM_SLOTS, 24)
+    ahead = Ahead(table, starts[0], end, left, jnp.int32(40))
+    found = jax.jit(partial(rehearse, Seen(WORLD.spec, 40), POLICY))(ahead, prompts)
+    query = Query(prompts, jnp.ones(24, bool))
+    real = jax.jit(jax.vmap(lambda key, query: rollout(key, WORLD, POLICY, task, query)))(
+        jax.random.split(jax.random.key(0), 24), query
+    )
+    goals = np.asarray(real.trajectory.achieved_goals)
+    known = graph_names(table)
+    for i in range(24):
+        length = int(real.trajectory.length[i])
+        hits = np.flatnonzero((np.abs(goals[i, :length] - table.goals[end]) < 1e-3).all(axis=1))
+        if found.ends[i] == ARRIVES:
+            assert int(found.steps[i]) == hits[0] + 1
+        elif found.ends[i] == LEAVES:
+            assert int(found.steps[i]) < FAR or left[starts[0]] == FAR
+        elif (
+            hits.size
+        ):  # an episode that arrives either was surely to, or left what was known before
+            pytest.fail(
+                f"prompt {i} arrives after {hits[0] + 1} steps; its rehearsal failed in {known}"
+            )
+
+
+def graph_names(table):
+    return np.round(np.asarray(table.goals)[: int(table.size)], 3).tolist()
+
+
+def test_changed_prompts_are_prompts_of_the_way():
+    way = Goals(
+        jnp.arange(20.0).reshape(10, 2),
+        jnp.arange(10) < 8,
+        jnp.arange(20.0).reshape(10, 2),
+        jnp.int32(8),
+    )
+    prompt = prompt_of([[2.0, 3.0], [8.0, 9.0], [14.0, 15.0]], NUM_SLOTS)
+    many = jax.vmap(lambda key: changed(key, prompt, way, 4, jnp.float32(0.01), jnp.int32(3)))(
+        jax.random.split(jax.random.key(0), 400)
+    )
+    counts = set()
+    for i in range(400):
+        goals = goals_of(jax.tree.map(lambda leaf, i=i: leaf[i], many))
+        counts.add(len(goals))
+        assert goals[-1].tolist() == [14.0, 15.0]
+        places = np.round(goals[:-1, 0] / 2)
+        assert (np.diff(places) >= 0).all()  # in the order of the way
+        assert (places < 7).all()  # the end of the way is not inserted
+        assert np.abs(goals[:-1] - np.round(goals[:-1])).max(initial=0) < 0.1
+    assert counts == {2, 3, 4}  # never longer than asked for
+    alone = prompt_of([[14.0, 15.0]], NUM_SLOTS)
+    same = changed(jax.random.key(0), alone, way, 1, jnp.float32(0.01), jnp.int32(3))
+    assert same.mask.tolist() == alone.mask.tolist()
+
+
+def adapted(tasks, features=Features(), num_episodes=30, policy=POLICY, num_states=100):  # noqa: B008
+    space = SearchSpace(
+        num_slots=policy.num_slots,
+        horizon=WORLD.horizon,
+        return_range=WORLD.spec.return_range,
+        num_episodes=num_episodes,
+        sample_goal=WORLD.sample_goal,
+    )
+    optimizer = plan_map(space, WORLD.spec, policy, num_states, features)
+    adapter = prompt_adapter(policy, optimizer)
+    keys = jax.random.split(jax.random.key(7), len(tasks.goal))
+
+    def one(key, task):
+        result = search(key, WORLD, adapter, task, num_episodes)
+        episode = rollout(key, WORLD, policy, task, result.best)
+        return result, episode.return_
+
+    return jax.jit(jax.vmap(one))(keys, tasks)
+
+
+@pytest.fixture(scope="module")
+def finals(tasks):
+    return adapted(tasks)
+
+
+def test_the_plan_finds_shortest_ways(tasks, finals):
+    optimum = np.asarray(jax.vmap(WORLD.optimal_return)(tasks))
+    result, returns = finals
+    first = np.asarray(result.log.returns)[:, 0, 0]
+    assert np.mean(optimum - first > 0.05) > 0.3  # the policy alone gets stuck
+    assert np.mean(optimum - returns < 1e-4) > 0.9
+
+
+def test_the_best_prompt_is_worth_what_was_seen_of_it(finals):
+    result, returns = finals
+    log = result.log
+    greedy = np.asarray(log.choices.greedy)
+    seen = np.where(greedy, np.asarray(log.returns)[..., 0], -np.inf).max(axis=1)
+    np.testing.assert_allclose(np.asarray(returns), seen, atol=1e-5)
+
+
+def test_lanes_equal_single_searches(tasks, finals):
+    result, _ = finals
+    alone, _ = adapted(jax.tree.map(lambda leaf: leaf[:1], tasks))
+    keys = jax.random.split(jax.random.key(7), 1)
+    if (
+        jax.random.key_data(keys)[0]
+        == jax.random.key_data(jax.random.split(jax.random.key(7), 12))[0]
+    ).all():
+        np.testing.assert_array_equal(alone.log.returns[0], result.log.returns[0])
+
+
+@pytest.mark.parametrize(
+    "features",
+    [Features(rounds=0), Features(splice=False), Features(frontier=False)],
+    ids=["no rehearsal", "no splicing", "no frontier"],
+)
+def test_ablations_run_and_are_no_better(tasks, finals, features):
+    optimum = np.asarray(jax.vmap(WORLD.optimal_return)(tasks))
+    _, returns = adapted(tasks, features)
+    assert np.mean(optimum - returns) >= np.mean(optimum - finals[1]) - 0.02
+
+
+def test_a_map_without_room_still_adapts(tasks):
+    _, returns = adapted(tasks, num_states=3, num_episodes=6)
+    assert np.isfinite(returns).all()
+
+
+def test_prompts_of_one_goal_still_adapt(tasks):
+    _, returns = adapted(tasks, policy=compass(num_slots=1), num_episodes=4)
+    assert np.isfinite(returns).all()
+
+
+class Played(NamedTuple):
+    query: Query
+    first: jax.Array
+    order: object
+
+
+NUM_GOALS = 5
+
+
+def orderly(prompt, hidden, horizon=12):
+    """An episode that reaches the goals of a prompt in turn, and is paid for the hidden order's beginning.
+
+    After the first goal that is not the next, nothing more is paid.
+    """
+    inner, used = prompt.goals[:-1], prompt.mask[:-1]
+    order = jnp.argsort(~used)
+    reached = jnp.argmax(inner[order], axis=-1)
+    num = used.sum()
+    right = jnp.cumprod((reached == hidden[: len(reached)]) & (jnp.arange(len(reached)) < num))
+    pad = horizon - len(reached)
+    goals = jnp.pad(jax.nn.one_hot(reached, NUM_GOALS), ((0, pad), (0, 0)))
+    happens = jnp.arange(horizon) < num
+    goals = jnp.where(happens[:, None], goals, 0.0)
+    rewards = jnp.pad(right / NUM_GOALS, (0, pad))
+    steps = Trajectory(
+        obs=jnp.zeros((horizon, 1)),
+        actions=jnp.zeros(horizon, jnp.int32),
+        achieved_goals=goals,
+        goal_reached=happens,
+        outcomes=goals,
+        length=jnp.maximum(num, 1),
+    )
+    return Episode(steps, rewards, rewards.sum(), jnp.zeros(1), jnp.zeros(NUM_GOALS))
+
+
+def order_search(key, hidden, num_episodes=40, deterministic=True):
+    space = SearchSpace(
+        num_slots=NUM_GOALS + 1,
+        horizon=12,
+        return_range=(0.0, 1.0),
+        num_episodes=num_episodes,
+        sample_goal=lambda key: jnp.zeros(NUM_GOALS),
+        deterministic=deterministic,
+    )
+    optimizer = plan_order(space)
+    task_goal = jnp.ones(NUM_GOALS)
+
+    def another(state, key):
+        key, key_prompt = jax.random.split(key)
+        query, asked = optimizer.ask(key, state)
+        # The first prompt names nothing, and then the agent does something at random.
+        at_random = jax.nn.one_hot(jax.random.permutation(key_prompt, NUM_GOALS), NUM_GOALS)
+        acted = query.prompt._replace(
+            goals=jnp.concatenate([at_random, task_goal[None]]), mask=jnp.ones(NUM_GOALS + 1, bool)
+        )
+        alone = query.prompt.mask.sum() == 1
+        prompt = jax.tree.map(lambda a, b: jnp.where(alone, a, b), acted, query.prompt)
+        episode = orderly(prompt, hidden)
+        return optimizer.tell(asked, query, episode), (
+            query,
+            asked.first,
+            state.order,
+            episode.return_,
+        )
+
+    state = optimizer.init(key, task_goal)
+    state, log = jax.lax.scan(another, state, jax.random.split(key, num_episodes))
+    return orderly(optimizer.best(state), hidden).return_, log
+
+
+@pytest.fixture(scope="module")
+def orders():
+    keys = jax.random.split(jax.random.key(1), 8)
+    hidden = jax.vmap(lambda key: jax.random.permutation(key, NUM_GOALS))(keys)
+    return jax.jit(jax.vmap(order_search))(keys, hidden)
+
+
+def test_the_hidden_order_is_found(orders):
+    best, (_, _, _, returns) = orders
+    np.testing.assert_allclose(best, 1.0, atol=1e-5)
+    # By elimination a goal of n costs at most n - 1 wrong trials, so all together 1 + 4 + 3 + 2 + 1.
+    solved_after = np.argmax(np.asarray(returns) > 1 - 1e-4, axis=1)
+    assert solved_after.max() <= 11
+
+
+def test_what_was_ruled_out_is_never_tried_again(orders):
+    _, (_, first, before, _) = orders
+    for lane in range(len(first)):
+        for episode in range(first.shape[1]):
+            number = int(first[lane, episode])
+            if number != NONE:
+                assert not before.excluded[lane, episode, number]
+                assert number not in np.asarray(before.prefix)[lane, episode].tolist()
+
+
+def test_a_prompt_without_one_of_its_goals():
+    prompt = prompt_of([[1.0], [2.0], [3.0], [9.0]], 5)
+    assert goals_of(without(prompt, jnp.int32(2)))[:, 0].tolist() == [1.0, 3.0, 9.0]
+    assert goals_of(without(prompt, jnp.int32(1)))[:, 0].tolist() == [2.0, 3.0, 9.0]
+    assert goals_of(without(prompt, jnp.int32(0)))[:, 0].tolist() == [1.0, 2.0, 3.0, 9.0]
+
+
+def test_moved_goals_keep_the_task_goal():
+    prompt = prompt_of([[1.0], [2.0], [9.0]], 5)
+    moved = moved_goals(jax.random.key(0), prompt)
+    assert moved.mask.tolist() == prompt.mask.tolist()
+    assert float(moved.goals[-1, 0]) == 9.0 and (moved.goals[:2] == 0).all()
+    assert 0 < float(jnp.abs(moved.goals - prompt.goals).max()) < 2
