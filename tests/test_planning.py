@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,8 @@ from mgpo_jax.optimizers.methods import prompt_adapter
 from mgpo_jax.planning.maps import Features, plan_map
 from mgpo_jax.planning.orders import NONE, moved_goals, plan_order, without
 from mgpo_jax.planning.proposals import changed, random_prompts
-from mgpo_jax.planning.rehearsal import ARRIVES, LEAVES, Ahead, Seen, rehearse
+from mgpo_jax.planning.rehearsal import ARRIVES, FAILS, Ahead, Seen, rehearse
+from mgpo_jax.planning.steering import deficits, lead_along, steer
 from mgpo_jax.planning.table import (
     FAR,
     UNKNOWN,
@@ -40,7 +41,7 @@ SIDE, NUM_SLOTS = 9, 5
 WORLD = MazeRunner(name="small", side=SIDE, horizon=40)
 
 
-def compass(num_slots: int = NUM_SLOTS, sharpness: float = 4.0) -> Policy:
+def compass(num_slots: int = NUM_SLOTS, sharpness: float = 1.0) -> Policy:
     """A policy that needs no training: it steps towards the first goal of its prompt that it has not
     reached, and only where the way is free. It gets stuck in dead ends, so that prompts matter."""
     moves = jnp.array([(0, -1), (-1, 0), (0, 1), (1, 0)]) / SIDE
@@ -62,7 +63,16 @@ def compass(num_slots: int = NUM_SLOTS, sharpness: float = 4.0) -> Policy:
         distribution, slot = decide(prompt, slot, obs)
         return distribution, (prompt, slot)
 
-    return Policy(prefill, decode, lambda carry, num_steps: carry, num_slots)
+    def score(prompt, obs, actions):
+        del actions  # it looks at where it is and not at what it did
+
+        def step(slot, obs):
+            distribution, slot = decide(prompt, slot, obs)
+            return slot, distribution
+
+        return jax.lax.scan(step, jnp.argmax(prompt.mask), obs)[1]
+
+    return Policy(prefill, decode, lambda carry, num_steps: carry, num_slots, score)
 
 
 POLICY = compass()
@@ -128,12 +138,9 @@ def test_known_ways_are_those_of_the_union_of_all_episodes(tasks, index):
         assert {n: int(before[i]) for i, n in enumerate(names) if before[i] < FAR} == dict(wanted)
         way = shortest_way(jax.random.key(0), table, starts[0], steps_to(table, jnp.int32(end)), 40)
         walked = [start, *[int(i) for i in way if i != UNKNOWN]]
-        assert walked[-1] == end and len(walked) - 1 == int(after[end])
-        assert all(
-            graph.has_edge(names[a], names[b])
-            for a, b in zip(walked, walked[1:], strict=False)
-            if a != b
-        )
+        assert walked[-1] == end
+        assert len(walked) - 1 == int(after[end])
+        assert all(graph.has_edge(names[a], names[b]) for a, b in pairwise(walked))
 
 
 def test_a_hand_drawn_way_is_spliced_from_two_episodes():
@@ -194,24 +201,36 @@ def test_what_a_rehearsal_calls_sure_an_episode_does(tasks, index):
         jax.random.split(jax.random.key(0), 24), query
     )
     goals = np.asarray(real.trajectory.achieved_goals)
-    known = graph_names(table)
     for i in range(24):
         length = int(real.trajectory.length[i])
         hits = np.flatnonzero((np.abs(goals[i, :length] - table.goals[end]) < 1e-3).all(axis=1))
         if found.ends[i] == ARRIVES:
             assert int(found.steps[i]) == hits[0] + 1
-        elif found.ends[i] == LEAVES:
-            assert int(found.steps[i]) < FAR or left[starts[0]] == FAR
-        elif (
-            hits.size
-        ):  # an episode that arrives either was surely to, or left what was known before
-            pytest.fail(
-                f"prompt {i} arrives after {hits[0] + 1} steps; its rehearsal failed in {known}"
-            )
+        elif found.ends[i] == FAILS:
+            assert not hits.size
 
 
-def graph_names(table):
-    return np.round(np.asarray(table.goals)[: int(table.size)], 3).tolist()
+def test_steering_moves_a_prompt_onto_a_way(tasks):
+    # Led by its last goal alone the compass goes straight; the way goes around.
+    task = MazeTask(jnp.zeros((SIDE, SIDE), jnp.int32).at[4, 2:7].set(1), jnp.array([1, 4]))
+    around = prompt_of(np.array([[7, 1], [1, 1], [1, 4]]) / SIDE, NUM_SLOTS)
+    episode = rollout(jax.random.key(0), WORLD, POLICY, task, Query(around, jnp.ones((), bool)))
+    table, start = add_episode(empty_table(WORLD.spec, 100), episode)
+    left = steps_to(table, find_state(table, WORLD.task_goal(task)))
+    way = shortest_way(jax.random.key(0), table, start, left, 40)
+    lead = lead_along(table, start, way, 32)
+    assert lead.complete
+    assert int(lead.real.sum()) == int(left[start]) == int(episode.trajectory.length)
+    assert deficits(POLICY, lead, jax.tree.map(lambda leaf: leaf[None], around))[0] == 0
+    beside = prompt_of(np.array([[7.4, 1.9], [1.2, 1.3], [1, 4]]) / SIDE, NUM_SLOTS)
+    first = jax.tree.map(lambda leaf: leaf[None], beside)
+    before = deficits(POLICY, lead, first)
+    steered, after = steer(POLICY, lead, first, table.stride, 50)
+    assert after[0] < before[0]
+    np.testing.assert_array_equal(steered.goals[0, -1], beside.goals[-1])
+    np.testing.assert_array_equal(steered.goals[0, :2], 0)
+    np.testing.assert_allclose(deficits(POLICY, lead, steered), after, atol=1e-5)
+    assert not lead_along(table, start, way, 4).complete
 
 
 def test_changed_prompts_are_prompts_of_the_way():
@@ -250,7 +269,7 @@ def adapted(tasks, features=Features(), num_episodes=30, policy=POLICY, num_stat
     )
     optimizer = plan_map(space, WORLD.spec, policy, num_states, features)
     adapter = prompt_adapter(policy, optimizer)
-    keys = jax.random.split(jax.random.key(7), len(tasks.goal))
+    keys = jax.random.split(jax.random.key(7), 12)[: len(tasks.goal)]
 
     def one(key, task):
         result = search(key, WORLD, adapter, task, num_episodes)
@@ -281,21 +300,23 @@ def test_the_best_prompt_is_worth_what_was_seen_of_it(finals):
     np.testing.assert_allclose(np.asarray(returns), seen, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_lanes_equal_single_searches(tasks, finals):
     result, _ = finals
     alone, _ = adapted(jax.tree.map(lambda leaf: leaf[:1], tasks))
-    keys = jax.random.split(jax.random.key(7), 1)
-    if (
-        jax.random.key_data(keys)[0]
-        == jax.random.key_data(jax.random.split(jax.random.key(7), 12))[0]
-    ).all():
-        np.testing.assert_array_equal(alone.log.returns[0], result.log.returns[0])
+    np.testing.assert_array_equal(alone.log.returns[0], result.log.returns[0])
+
+
+ABLATIONS = (Features(steering=0), Features(splice=False), Features(frontier=False))
 
 
 @pytest.mark.parametrize(
     "features",
-    [Features(rounds=0), Features(splice=False), Features(frontier=False)],
-    ids=["no rehearsal", "no splicing", "no frontier"],
+    [
+        Features(rounds=0),
+        *(pytest.param(case, marks=pytest.mark.slow) for case in ABLATIONS),
+    ],
+    ids=["no rehearsal", "no steering", "no splicing", "no frontier"],
 )
 def test_ablations_run_and_are_no_better(tasks, finals, features):
     optimum = np.asarray(jax.vmap(WORLD.optimal_return)(tasks))
@@ -311,12 +332,6 @@ def test_a_map_without_room_still_adapts(tasks):
 def test_prompts_of_one_goal_still_adapt(tasks):
     _, returns = adapted(tasks, policy=compass(num_slots=1), num_episodes=4)
     assert np.isfinite(returns).all()
-
-
-class Played(NamedTuple):
-    query: Query
-    first: jax.Array
-    order: object
 
 
 NUM_GOALS = 5
@@ -419,5 +434,6 @@ def test_moved_goals_keep_the_task_goal():
     prompt = prompt_of([[1.0], [2.0], [9.0]], 5)
     moved = moved_goals(jax.random.key(0), prompt)
     assert moved.mask.tolist() == prompt.mask.tolist()
-    assert float(moved.goals[-1, 0]) == 9.0 and (moved.goals[:2] == 0).all()
+    assert float(moved.goals[-1, 0]) == 9.0
+    assert (moved.goals[:2] == 0).all()
     assert 0 < float(jnp.abs(moved.goals - prompt.goals).max()) < 2

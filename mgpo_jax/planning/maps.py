@@ -314,6 +314,8 @@ def plan_map(
       num_states: room for states in the map.
       features: what the plan makes use of.
     """
+    if space.num_slots == 1:  # there is one prompt, and nothing to search
+        features = Features(rounds=0, steering=0, splice=features.splice, frontier=False)
     world = Seen(spec, spec.horizon)
     tools = Tools(space, world, policy, features)
     num_arms = min(64, space.num_episodes)
@@ -425,7 +427,7 @@ def explore(
     key_subset, key_frontier = jax.random.split(key)
     source = choose(known < FAR, way, state.latest)
     subset = sample_prompt(key_subset, source, state.task_goal, space.num_slots, space.longest)
-    if not tools.features.frontier or space.num_slots == 1 or not table.goals.shape[0]:
+    if not tools.features.frontier:
         return subset, jnp.int32(UNKNOWN)
 
     def to_frontier() -> tuple[Prompt, Array]:
