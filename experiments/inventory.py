@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from math import ceil
@@ -216,17 +216,13 @@ def _estimate(config: ReproduceConfig, settings: AdaptConfig) -> float | None:
     return None if rate is None else rate * episodes * lanes
 
 
-@cache
 def seconds_per_episode(world: str, method: Method) -> float | None:
     """CPU-seconds of an episode in the published adaptations of a world; None where none is like it.
 
     Those of the same method count, else the mean of those that learn in the same way. A method that learns
     nothing only acts: it costs at most what the cheapest of all does.
     """
-    rates = {
-        name: 1 / read_summary(folder)["episodes_per_cpu_second"]
-        for name, folder in _published_methods(world)
-    }
+    rates = _rates_in((PUBLISHED / file_name(world)).absolute())
     if method.name in rates:
         return rates[method.name]
     if not method.learns:
@@ -240,8 +236,11 @@ def way_of(method: Method) -> tuple[str, type]:
     return method.policy, method.hyper.__mro__[-2]  # the last one is object
 
 
-def _published_methods(world: str) -> Iterator[tuple[str, Path]]:
-    for name in methods.names():
-        folder = PUBLISHED / file_name(world) / file_name(name)
-        if folder.is_dir():
-            yield name, folder
+@cache
+def _rates_in(folder: Path) -> Mapping[str, float]:
+    """CPU-seconds of an episode in the adaptations that a folder holds, by the names of their methods."""
+    return {
+        name: 1 / read_summary(folder / file_name(name))["episodes_per_cpu_second"]
+        for name in methods.names()
+        if (folder / file_name(name)).is_dir()
+    }

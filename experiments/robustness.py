@@ -144,11 +144,16 @@ def known(config: ReproduceConfig, cell: Cell, noise: Noise) -> Behind | None:
     return next((r for r in of_world if r.is_of(cell.world, cell.method, noise, summary)), None)
 
 
-@cache
 def published_rows(world: str) -> tuple[Behind, ...]:
     """The rows that were published for a world."""
+    return _rows_in((PUBLISHED / file_name(world)).absolute())
+
+
+@cache
+def _rows_in(folder: Path) -> tuple[Behind, ...]:
+    """The rows in the files of a folder; one that is damaged is left out with a line on stderr."""
     found: list[Behind] = []
-    for path in sorted((PUBLISHED / file_name(world)).glob("noise*.json")):
+    for path in sorted(folder.glob("noise*.json")):
         try:
             found += read_document(path, _Rows).rows
         except DataError as error:
