@@ -8,11 +8,12 @@ import shutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import envs
-from envs.errors import UsageError, nearest
+from envs.errors import NotAvailableError, nearest
 from experiments.adaptation import adapt_all, deciding, save_outcome
 from experiments.drawing import write
 from experiments.figures import later, learning_curve
@@ -26,6 +27,7 @@ from experiments.store.seals import write_sealed
 from experiments.store.settings import (
     AdaptConfig,
     DataConfig,
+    PretrainConfig,
     ReproduceConfig,
     pretrain_preset,
 )
@@ -54,10 +56,24 @@ class Line(NamedTuple):
     paper: str
 
 
-def trained(
+class Part(NamedTuple):
+    """A row of an ablation before it is made."""
+
+    label: str
+    name: str
+    """In the paper's table."""
+    training: PretrainConfig | None
+    """That of its policy; None for the released one."""
+    hyper: UcbHyper
+    results: Path
+    together: str
+    """Parts that have this in common are adapted in one program."""
+
+
+def planned(
     config: ReproduceConfig, label: str, demonstrator: str | None = None, **changes: Any
-) -> Path:
-    """The policy of one training, which is run or continued if it is not finished.
+) -> PretrainConfig:
+    """The settings of one training, its folder among them.
 
     Args:
       config: settings of the command.
@@ -73,10 +89,16 @@ def trained(
         **changes,
     )
     size = f"{config.num_steps}steps-{config.num_trajectories}episodes"
-    folder = config.folder / "policies" / f"{label}-k{settings.max_prompt_length}-{size}"
+    name = f"{label}-k{settings.max_prompt_length}-{size}"
+    return replace(settings, out=config.folder / "policies" / name)
+
+
+def trained(settings: PretrainConfig) -> Path:
+    """The policy of one training, which is run or continued if it is not finished."""
+    folder = settings.folder
     if not runs.is_finished(folder):
         print(f"training {folder}", file=sys.stderr)
-        train(replace(settings, out=folder, resume=runs.has_begun(folder)), GO_ON)
+        train(replace(settings, resume=runs.has_begun(folder)), GO_ON)
     return folder / runs.POLICY
 
 
@@ -124,22 +146,23 @@ def adapted(
         shutil.rmtree(pieces)
 
 
-def table4(config: ReproduceConfig) -> list[Line]:
+def table4(config: ReproduceConfig) -> list[Part]:
     """Longest prompt K and exploration constant c, with the released policy (Table 4)."""
-    folder, world = config.folder / "table4", envs.find(config.world)
-    lengths = {
-        folder / f"K{k}-{config.seeds}seeds": UCB.hyper_in(world, {"max_goals": k})
+    world = envs.find(config.world)
+
+    def part(label: str, name: str, hyper: UcbHyper, together: str) -> Part:
+        results = config.folder / "table4" / f"{name}-{config.seeds}seeds"
+        return Part(label, label, None, hyper, results, together)
+
+    lengths = [
+        part(f"K = {k}", f"K{k}", UCB.hyper_in(world, {"max_goals": k}), "K")
         for k in (1, 2, 3, LONGEST)
-    }
-    constants = {  # Eq. 3 as printed
-        folder / f"c{c}-{config.seeds}seeds": UcbHyper(c=float(c), max_goals=LONGEST, scale=1.0)
+    ]
+    constants = [  # Eq. 3 as printed
+        part(f"c = {c}", f"c{c}", UcbHyper(c=float(c), max_goals=LONGEST, scale=1.0), "c")
         for c in (0, 1, 10)
-    }
-    adapted(config, None, lengths)
-    adapted(config, None, constants)
-    lines = [(f"K = {hyper.max_goals}", path) for path, hyper in lengths.items()]
-    lines += [(f"c = {hyper.c:.0f}", path) for path, hyper in constants.items()]
-    return [Line(label, path, paper_value("table4", world.home, label)) for label, path in lines]
+    ]
+    return lengths + constants
 
 
 def chosen(config: ReproduceConfig, names: Sequence[str]) -> Sequence[str]:
@@ -153,18 +176,16 @@ def chosen(config: ReproduceConfig, names: Sequence[str]) -> Sequence[str]:
 def compared(
     config: ReproduceConfig,
     names: Sequence[str],
-    policy_of: Callable[[str], Path],
+    training_of: Callable[[str], PretrainConfig],
     label: str = "{}",
-) -> list[Line]:
+) -> list[Part]:
     """One policy, and one adaptation with it, for each of the names that ``--only`` leaves."""
-    lines = []
+    hyper, parts = UCB.hyper_in(envs.find(config.world)), []
     for name in chosen(config, names):
-        policy = policy_of(name)
-        results = config.folder / config.what / f"{policy.parent.name}-{config.seeds}seeds"
-        adapted(config, policy, {results: UCB.hyper_in(envs.find(config.world))})
-        paper = paper_value(config.what, envs.find(config.world).home, name)
-        lines.append(Line(label.format(name), results, paper))
-    return lines
+        training = training_of(name)
+        results = config.folder / config.what / f"{training.folder.name}-{config.seeds}seeds"
+        parts.append(Part(label.format(name), name, training, hyper, results, name))
+    return parts
 
 
 def demonstrators(config: ReproduceConfig) -> list[str]:
@@ -172,53 +193,73 @@ def demonstrators(config: ReproduceConfig) -> list[str]:
     return list(envs.find(config.world).demonstrators(envs.make(config.world)))
 
 
-def table5(config: ReproduceConfig) -> list[Line]:
+def table5(config: ReproduceConfig) -> list[Part]:
     """One policy for each dataset (Table 5).
 
     Raises:
-      UsageError: for a world with one demonstrator.
+      NotAvailableError: for a world with one demonstrator.
     """
     names = demonstrators(config)
     if len(names) < 2:
-        raise UsageError(
+        raise NotAvailableError(
             f"there is no table5 for {config.world}: it compares datasets of several demonstrators; "
             "name another world with --env"
         )
-    return compared(config, sorted(names), lambda name: trained(config, name, name))
+    return compared(config, sorted(names), lambda name: planned(config, name, name))
 
 
-def figure8(config: ReproduceConfig) -> list[Line]:
+def figure8(config: ReproduceConfig) -> list[Part]:
     """One policy for each longest prompt K (Figure 8)."""
     first = demonstrators(config)[0]
     return compared(
         config,
         ("5", "10", "20", "40"),
-        lambda length: trained(config, first, first, max_prompt_length=int(length)),
+        lambda length: planned(config, first, first, max_prompt_length=int(length)),
         "K = {}",
     )
 
 
-def heads(config: ReproduceConfig) -> list[Line]:
+def heads(config: ReproduceConfig) -> list[Part]:
     """One policy for each distribution of continuous actions; the authors' code has the fixed Gaussian.
 
     Raises:
-      UsageError: for a world with discrete actions.
+      NotAvailableError: for a world with discrete actions.
     """
     if envs.make(config.world).spec.discrete:
-        raise UsageError(
+        raise NotAvailableError(
             f"there is no heads for {config.world}: it compares distributions of continuous actions; "
             "name another world with --env"
         )
     names = [name for name in HEADS if name != "categorical"]
-    return compared(config, names, lambda head: trained(config, head, head=head))
+    return compared(config, names, lambda head: planned(config, head, head=head))
 
 
-MAKE: dict[str, Callable[[ReproduceConfig], list[Line]]] = {
+PLANS: dict[str, Callable[[ReproduceConfig], list[Part]]] = {
     "table4": table4,
     "table5": table5,
     "figure8": figure8,
     "heads": heads,
 }
+
+
+def make(config: ReproduceConfig) -> list[Line]:
+    """Train and adapt what is missing of an ablation; returns the rows of its table.
+
+    Raises:
+      UsageError: for a row that it does not have, or a world that it is not of.
+    """
+    lines = []
+    for _, group in groupby(PLANS[config.what](config), key=lambda part: part.together):
+        parts = list(group)
+        training = parts[0].training
+        policy = None if training is None else trained(training)
+        adapted(config, policy, {part.results: part.hyper for part in parts})
+        home = envs.find(config.world).home
+        lines += [
+            Line(part.label, part.results, paper_value(config.what, home, part.name))
+            for part in parts
+        ]
+    return lines
 
 
 def files_of(config: ReproduceConfig) -> tuple[Path, Path]:

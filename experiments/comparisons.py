@@ -1,4 +1,5 @@
 """The paper's comparisons of methods in several worlds (Tables 1, 2 and 8; Figures 6 and 7), cell by cell.
+Table 3 has the same cells (``experiments.robustness``).
 
 A cell is one adaptation, which lies in a folder of its own and can be resumed by itself. What was published
 under ``results/`` is taken from there if it is of the same weights, tasks and settings.
@@ -7,7 +8,7 @@ under ``results/`` is taken from there if it is of the same weights, tasks and s
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
 from pathlib import Path
@@ -16,18 +17,20 @@ from typing import Any, NamedTuple
 import jax
 
 import envs
-from envs.errors import DataError, UsageError, nearest
+from envs.errors import DataError, NotAvailableError, UsageError, nearest
 from experiments.adaptation import adapt_and_save, finished
 from experiments.drawing import pictures_together, write
 from experiments.figures import later, learning_curves
+from experiments.prompt_lengths import entropy_table
+from experiments.runtime import say
 from experiments.store import runs
 from experiments.store.paper import paper_final, paper_worlds
-from experiments.store.results import load_results
+from experiments.store.results import Results, load_results
 from experiments.store.rows import PAPER_EPISODES, read_row
 from experiments.store.seals import check_replaceable, write_sealed
 from experiments.store.settings import AdaptConfig, ReproduceConfig, file_name, pretrain_preset
 from experiments.store.statistics import SeedSpread
-from experiments.store.summary import Summary, read_summary
+from experiments.store.summary import read_summary
 from experiments.store.tables import number, table
 from experiments.training import train
 from mgpo_jax import methods
@@ -66,6 +69,11 @@ TABLES: Mapping[str, Comparison] = {
         title="Table 2: prompt optimization methods",
         methods=("grips", "bbt", "explore", "ucb", "bpe"),
     ),
+    "table3": Comparison(
+        title="Table 3: optimized prompts behind noise",
+        methods=("grips", "bbt", "ucb", "bpe"),
+        further=("explore",),
+    ),
     "table8": Comparison(
         title="Table 8: BC-finetune with two algorithms",
         methods=("reinforce", "ppo"),
@@ -82,13 +90,15 @@ class Picture(NamedTuple):
     methods: tuple[str, ...]
     pattern: str
     """Of the names of its files among those that ``experiments.plot`` draws."""
+    numbers: Callable[[Results], str] | None = None
+    """A table of an adaptation that says in numbers what the figure shows, in Markdown."""
 
 
 PICTURES: Mapping[str, Picture] = {
     "figure2": Picture(TABLES["table2"].methods, "*_prompts.png"),
     "figure3": Picture(("ucb",), "*_evolution_*.png"),
     "figure5": Picture(("ucb",), "*.gif"),
-    "figure9": Picture(("ucb",), "*_short_and_long.png"),
+    "figure9": Picture(("ucb",), "*_short_and_long.png", entropy_table),
     "figure10": Picture(("ucb",), "*_evolution_*.png"),
 }
 
@@ -139,10 +149,14 @@ def methods_of(config: ReproduceConfig) -> Sequence[str]:
     return config.only or known
 
 
+def num_seeds(config: ReproduceConfig) -> int:
+    """Independent adaptations to each task."""
+    return 1 if config.scale == "smoke" else config.seeds
+
+
 def cell_config(config: ReproduceConfig, world: str, method: str) -> AdaptConfig:
     """The settings of the adaptation of one cell. A method that learns nothing needs one episode."""
-    smoke = config.scale == "smoke"
-    seeds = 1 if smoke else config.seeds
+    smoke, seeds = config.scale == "smoke", num_seeds(config)
     budget = SMOKE_EPISODES if smoke else PAPER_EPISODES
     learns = methods.find(method).learns
     name = f"{file_name(method)}-{config.scale}-{seeds}seeds"
@@ -172,7 +186,7 @@ def made(config: ReproduceConfig, world: str, method: str) -> Cell:
     Worlds that are not installed and networks that are not released make it an empty one.
     """
     settings = cell_config(config, world, method)
-    if config.scale == "cpu" and (place := published(settings)) is not None:
+    if (place := published(config, settings)) is not None:
         return Cell(world, method, place)
     try:
         record, env = envs.find(world), envs.make(world)
@@ -202,10 +216,10 @@ def _train(folder: Path, world: str, kind: str) -> None:
     train(replace(preset, out=folder, resume=runs.has_begun(folder)), GO_ON)
 
 
-def published(settings: AdaptConfig) -> Path | None:
+def published(config: ReproduceConfig, settings: AdaptConfig) -> Path | None:
     """The published results of the settings of a cell; None if there are none, or others."""
     folder = PUBLISHED / file_name(settings.env) / file_name(settings.method)
-    if not folder.is_dir():
+    if config.scale != "cpu" or not folder.is_dir():
         return None
     try:
         row = read_row(folder)
@@ -262,16 +276,16 @@ def _row(cell: Cell, scale: str, notes: Notes) -> list[str]:
         title,
         paper,
         str(ours),
-        _gap(paper, summary),
+        gap(paper, summary["final_return"]),
         number(summary.get("best_episode_return")),
         " x ".join(map(str, size)),
         f"{summary['cpu_seconds'] / 60:.1f}",
     ]
 
 
-def _gap(paper: str, summary: Summary) -> str:
-    """Ours minus the paper's; empty where the paper has nothing."""
-    return f"{summary['final_return'] - float(paper.split()[0]):+.3f}" if paper else ""
+def gap(paper: str, ours: float) -> str:
+    """Ours minus the paper's number, with which its text begins; empty where the paper has nothing."""
+    return f"{ours - float(paper.split()[0]):+.3f}" if paper else ""
 
 
 def files_of(config: ReproduceConfig) -> tuple[Path, Path]:
@@ -306,48 +320,41 @@ def _curves(found: Sequence[Cell]) -> dict[str, dict[str, Any]]:
 def draw(config: ReproduceConfig) -> list[Path]:
     """Draw a figure of prompts in each of its worlds, of adaptations that are made where they are missing.
 
+    Where the figure also has numbers, their table is printed and written beside it.
+
     Returns the files.
 
     Raises:
       UsageError: if a world or a network is missing, or a world draws no such figure.
     """
-    figure = PICTURES[config.what]
-    drawn: list[Path] = []
-    for world in worlds_of(config):
-        results = {}
-        for method in figure.methods:
-            cell = made(config, world, method)
-            if cell.results is None:
-                raise UsageError(f"there is no {config.what} for {world}: {cell.reason}")
-            results[method] = load_results(cell.results)
-        saves = {
-            config.out / f"{config.what}-{config.scale}_{name}": save
-            for name, save in pictures_together(results, (), seed=0)
-            if fnmatch(name, figure.pattern)
-        }
-        if not saves:
-            raise UsageError(f"there is no {config.what} for {world}, which draws nothing like it")
-        check_replaceable(saves)
-        config.out.mkdir(parents=True, exist_ok=True)
-        for path, save in saves.items():
-            write(path, save)
-        drawn += saves
-    return drawn
+    return [path for world in worlds_of(config) for path in _draw_in(config, world)]
 
 
-def costs(config: ReproduceConfig) -> str:
-    """What each comparison has already, and what that took."""
-    rows = []
-    for name, comparison in TABLES.items():
-        asked = replace(config, what=name, only=())
-        for world in worlds_of(asked):
-            have, spent = 0, 0.0
-            known = (*comparison.methods, *comparison.further)
-            for method in known:
-                settings = cell_config(asked, world, method)
-                folder = settings.folder if settings.folder.is_dir() else published(settings)
-                if folder is not None:
-                    have += 1
-                    spent += read_summary(folder)["cpu_seconds"] / 60
-            rows.append([name, world, f"{have} of {len(known)}", f"{spent:.0f}"])
-    return table(("what", "world", "cells there", "CPU-minutes of those"), rows)
+def _draw_in(config: ReproduceConfig, world: str) -> list[Path]:
+    """The files of a figure in one world."""
+    figure, results = PICTURES[config.what], {}
+    for method in figure.methods:
+        cell = made(config, world, method)
+        if cell.results is None:
+            raise UsageError(f"there is no {config.what} for {world}: {cell.reason}")
+        results[method] = load_results(cell.results)
+    place = config.out / f"{config.what}-{config.scale}_{file_name(world)}.md"
+    saves = {
+        config.out / f"{config.what}-{config.scale}_{name}": save
+        for name, save in pictures_together(results, (), seed=0)
+        if fnmatch(name, figure.pattern)
+    }
+    if not saves and figure.numbers is None:
+        raise NotAvailableError(
+            f"there is no {config.what} for {world}, which draws nothing like it"
+        )
+    check_replaceable((place, *saves) if figure.numbers else saves)
+    config.out.mkdir(parents=True, exist_ok=True)
+    for path, save in saves.items():
+        write(path, save)
+    if figure.numbers is None:
+        return list(saves)
+    text = figure.numbers(results[figure.methods[0]])
+    say(text)
+    write_sealed(place, lambda path: path.write_text(text, encoding="utf-8"))
+    return [*saves, place]

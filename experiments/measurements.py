@@ -22,8 +22,9 @@ from envs.errors import UsageError
 from envs.registry import World
 from envs.wrappers import Wrapper
 from experiments.datasets import collect, find_demonstrator
-from experiments.store.settings import pretrain_preset
+from experiments.store.settings import PretrainConfig, pretrain_preset
 from experiments.training import configured_network
+from mgpo_jax import methods
 from mgpo_jax.dataset import BatchPlan, Dataset
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.policy_files import load_policy
@@ -35,6 +36,9 @@ from mgpo_jax.sharding import device_mesh, largest_divisor
 from mgpo_jax.tasks import benchmark_tasks
 from mgpo_jax.training import Trainer, batch_stream
 from mgpo_jax.transformer import TransformerConfig
+
+BASELINES = ("reinforce", "ppo", "ptgm", "spirl")
+NUM_BASELINE_TASKS = 4
 
 
 @dataclass(frozen=True)
@@ -60,9 +64,10 @@ def measurements(
     yield row
     network = configured_network(recipe, env, dataset)
     yield from bench_gradient_step(recipe.train, network, env, dataset, 16 if quick else 64)
-    policy, note = policy_to_bench(world, recipe.train, network, dataset)
+    policy, note = policy_to_bench(world, env, recipe, dataset)
     yield from bench_acting(env, policy, note)
     yield bench_adaptation(world, env, policy, note, 20 if quick else 100)
+    yield from bench_baselines(world, env, env_name, dataset, 20 if quick else 40)
 
 
 def cpu_time(work: Callable[[], Any]) -> tuple[Any, float]:
@@ -167,13 +172,18 @@ def _step_rows(
 
 
 def policy_to_bench(
-    world: World, config: TrainConfig, network: TransformerConfig, dataset: Dataset
+    world: World, env: Environment, recipe: PretrainConfig, dataset: Dataset
 ) -> tuple[LoadedPolicy, str]:
-    """The released policy, or untrained weights where there is none."""
+    """The released network of the kind that a recipe trains, or untrained weights where there is none.
+
+    Raises:
+      UsageError: if the world has no such network.
+    """
     try:
-        return load_policy(world), "released policy"
+        return load_policy(world, kind=recipe.method), "released policy"
     except UsageError:
-        params = Trainer(config, network, dataset, device_mesh(1)).init().params
+        network = configured_network(recipe, env, dataset)
+        params = Trainer(recipe.train, network, dataset, device_mesh(1)).init().params
         return LoadedPolicy(network, params, {}), "untrained policy"
 
 
@@ -249,3 +259,29 @@ def bench_adaptation(
     outcome = adapt(env, policy, tasks, "ucb", seeds=3, episodes=episodes, judged=world.judged)
     note = f"{note}, {num} tasks x 3 seeds x {episodes} episodes"
     return Row("adaptation", outcome.num_episodes / outcome.cpu_seconds, "episodes / CPU-s", note)
+
+
+def bench_baselines(
+    world: World, env: Environment, env_name: str, dataset: Dataset, episodes: int
+) -> Iterator[Row]:
+    """What an episode of each baseline costs: acting, and what it learns from it.
+
+    The two episodes that judge each search are not divided by, a few percent of what was run. A baseline
+    that cannot be used in the world has no row.
+    """
+    tasks = benchmark_tasks(env, NUM_BASELINE_TASKS)
+    for name in BASELINES:
+        method = methods.find(name)
+        try:
+            recipe = pretrain_preset(env_name, "fast", method.policy)
+            policy, note = policy_to_bench(world, env, recipe, dataset)
+            outcome = adapt(
+                env, policy, tasks, method, method.hyper_in(world),
+                seeds=1, episodes=episodes, eval_every=episodes,
+            )  # fmt: skip
+        except UsageError:
+            continue
+        cost = 1e3 * outcome.cpu_seconds / outcome.returns.size
+        size = f"{NUM_BASELINE_TASKS} tasks x {episodes} episodes"
+        mean = float(outcome.lengths.mean())
+        yield Row(f"adapt {name}", cost, "CPU-ms / episode", f"{note}, {size} of {mean:.0f} steps")

@@ -1,10 +1,11 @@
 """Make a table of the paper with one command: ``python -m experiments.reproduce table1``.
 
 Tables 1, 2 and 8 compare methods in several worlds: cells that are missing are adapted, each by itself,
-and what cannot be had is a dash with the reason. An ablation is of one world, or of several one by one: it
-trains what is missing (a stopped run goes on where it was), adapts with UCB, prints the table and draws the
-learning curves. All trainings of an ablation have the same budget, shorter than that of the released
-policies and named above the table.
+and what cannot be had is a dash with the reason. Table 3 evaluates the same adaptations behind noise. An
+ablation is of one world, or of several one by one: it trains what is missing (a stopped run goes on where
+it was), adapts with UCB, prints the table and draws the learning curves. All trainings of an ablation have
+the same budget, shorter than that of the released policies and named above the table. ``all`` makes
+everything that is missing, and ``list`` says what that is.
 """
 
 from __future__ import annotations
@@ -16,23 +17,24 @@ from dataclasses import replace
 from typing import NoReturn
 
 import envs
-from envs.errors import UsageError, nearest
+from envs.errors import DataError, NotAvailableError, UsageError, nearest, printable
 from experiments.runtime import run, say
 from experiments.store.settings import (
+    ABLATIONS,
+    ALL,
     COMPARISONS,
+    GLANCE,
+    LIST,
     PICTURES,
     ReproduceConfig,
     check_reproduction,
 )
 from mgpo_jax.claims import check_place
 
-ABLATIONS = ("table4", "table5", "figure8", "heads")
-LIST = "list"
-
 
 def main(config: ReproduceConfig) -> None:
-    """Reproduce a table of the paper: train, adapt, print the table, draw the curves."""
-    known = (*COMPARISONS, *PICTURES, *ABLATIONS, LIST)
+    """Reproduce a table or figure of the paper: train, adapt, print the table, draw the curves."""
+    known = (*COMPARISONS, *PICTURES, *ABLATIONS, GLANCE, LIST, ALL)
     if not config.what:
         raise UsageError(f"no table given; name one of {', '.join(known)}")
     if config.what not in known:
@@ -40,38 +42,86 @@ def main(config: ReproduceConfig) -> None:
     for world in config.env:
         envs.find(world)
     check_reproduction(config)
-    if config.what in (LIST, *COMPARISONS, *PICTURES):
-        return make_comparison(config)
-    for world in config.env or (config.world,):
-        make_ablation(replace(config, env=(world,)))
-    return None
+    make(config)
+
+
+def make(config: ReproduceConfig) -> None:
+    """Make what a checked config asks for."""
+    if config.what in ABLATIONS:
+        for world in config.env or (config.world,):
+            make_ablation(replace(config, env=(world,)))
+        return
+    if not os.path.isdir(config.out):
+        check_place(config.out)
+    if config.what == ALL:
+        make_all(config)
+    elif config.what == LIST:
+        from experiments.inventory import inventory
+
+        say(inventory(config))
+    elif config.what == GLANCE:
+        from experiments import glance
+
+        glance.draw(config)  # which says what it has written
+    elif config.what in PICTURES:
+        from experiments.comparisons import draw
+
+        draw(config)
+    else:
+        make_comparison(config)
 
 
 def make_comparison(config: ReproduceConfig) -> None:
-    """Make a table or figure of several methods and worlds, or tell what there is of all of them."""
-    if not os.path.isdir(config.out):
-        check_place(config.out)
-    from experiments.comparisons import compare, costs, draw, files_of
+    """Make a table of several methods and worlds."""
+    from experiments import comparisons, robustness
 
-    if config.what == LIST:
-        say(costs(config))
-        return
-    if config.what in PICTURES:
-        draw(config)  # which says what it has written
-        return
-    say(compare(config))
-    print(f"table and curves in {files_of(config)[0]} and .png", file=sys.stderr)
+    behind_noise = config.what == "table3"
+    say(robustness.compare(config) if behind_noise else comparisons.compare(config))
+    place = comparisons.files_of(config)[0]
+    print(
+        f"table in {place}" if behind_noise else f"table and curves in {place} and .png",
+        file=sys.stderr,
+    )
+
+
+def make_all(config: ReproduceConfig) -> None:
+    """Make everything that is missing, one after the other.
+
+    What cannot be made is said in one line, and the rest goes on. What a world does not have, such as a
+    table of demonstrators where there is one, is no failure.
+
+    Raises:
+      DataError: at the end, if anything failed.
+    """
+    from experiments.inventory import jobs
+
+    todo, failed = jobs(config), []
+    for number, job in enumerate(todo, start=1):
+        name = " ".join([job.what, *job.env])
+        print(f"[{number} of {len(todo)}] {printable(name)}", file=sys.stderr)
+        try:
+            make(job)
+        except NotAvailableError as error:
+            print(f"{printable(name)} is left out: {printable(str(error))}", file=sys.stderr)
+        except (UsageError, DataError) as error:
+            print(f"{printable(name)} failed: {printable(str(error))}", file=sys.stderr)
+            failed.append(name)
+    if failed:
+        raise DataError(
+            f"{len(failed)} of {len(todo)} could not be made: {', '.join(failed)}; the lines above say why"
+        )
 
 
 def make_ablation(config: ReproduceConfig) -> None:
     """Make an ablation in one world."""
     if not os.path.isdir(config.folder):
         check_place(config.folder)
-    from experiments.ablations import MAKE, as_table, files_of, save
+    from experiments.ablations import as_table, files_of, save
+    from experiments.ablations import make as make_lines
     from experiments.store.seals import check_replaceable
 
     check_replaceable(files_of(config))
-    lines = MAKE[config.what](config)
+    lines = make_lines(config)
     budget = ""
     if config.what != "table4":  # which trains nothing
         steps, trajectories = config.num_steps, config.num_trajectories

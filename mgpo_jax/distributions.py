@@ -1,7 +1,7 @@
 """Action distributions: what a policy returns and training scores, behind one interface.
 
 A policy head puts out ``head.num_params(action_dim)`` numbers; ``head.make(params)`` turns them into
-a distribution with ``log_prob``, ``sample``, ``mode``, ``explore``, ``tempered`` and ``kl``.
+a distribution with ``log_prob``, ``sample``, ``mode``, ``explore``, ``tempered``, ``entropy`` and ``kl``.
 """
 
 from __future__ import annotations
@@ -35,6 +35,16 @@ class Distribution(Protocol):
         """The distribution whose density is this one's to the power of 1 / temperature, normalized."""
         ...
 
+    def entropy(self) -> Float[Array, "*batch"]:
+        """Minus the mean of ``log_prob``, in nats.
+
+        Of continuous actions it is that of a density before actions are clipped, and may be negative.
+
+        Raises:
+          NotAvailableError: where there is no closed form.
+        """
+        ...
+
     def kl(self, other: Any) -> Float[Array, "*batch"]:
         """KL(self, other) for another distribution of the same kind, in nats.
 
@@ -66,6 +76,10 @@ class Categorical(NamedTuple):
     def tempered(self, temperature: Float[Array, ""]) -> Categorical:
         return Categorical(self.logits / temperature)
 
+    def entropy(self) -> Float[Array, "*batch"]:
+        log_p = jax.nn.log_softmax(self.logits)
+        return -jnp.sum(jnp.exp(log_p) * log_p, axis=-1)
+
     def kl(self, other: Categorical) -> Float[Array, "*batch"]:
         log_p, log_q = jax.nn.log_softmax(self.logits), jax.nn.log_softmax(other.logits)
         return jnp.sum(jnp.exp(log_p) * (log_p - log_q), axis=-1)
@@ -96,6 +110,9 @@ class Gaussian(NamedTuple):
 
     def tempered(self, temperature: Float[Array, ""]) -> Gaussian:
         return Gaussian(self.mean, self.log_std + 0.5 * jnp.log(temperature))
+
+    def entropy(self) -> Float[Array, "*batch"]:
+        return jnp.sum(self.log_std + 0.5 * jnp.log(2 * jnp.pi * jnp.e), axis=-1)
 
     def kl(self, other: Gaussian) -> Float[Array, "*batch"]:
         """The divergence before actions are clipped."""
@@ -137,6 +154,9 @@ class Mixture(NamedTuple):
         # The integral of a component's density to the power of 1 / temperature.
         volume = (1 - 1 / temperature) * self.log_std.sum(axis=-1)
         return Mixture(self.logits / temperature + volume, self.mean, log_std)
+
+    def entropy(self) -> Float[Array, "*batch"]:
+        raise NotAvailableError("the entropy of a mixture has no closed form")
 
     def kl(self, other: Mixture) -> Float[Array, "*batch"]:
         raise NotAvailableError("the divergence of two mixtures has no closed form")
@@ -183,6 +203,10 @@ class Binned(NamedTuple):
 
     def tempered(self, temperature: Float[Array, ""]) -> Binned:
         return Binned(self.logits / temperature)
+
+    def entropy(self) -> Float[Array, "*batch"]:
+        intervals = self.logits.shape[-1] - 1
+        return jnp.sum(Categorical(self.logits).entropy() - jnp.log(intervals / 2), axis=-1)
 
     def kl(self, other: Binned) -> Float[Array, "*batch"]:
         return jnp.sum(Categorical(self.logits).kl(Categorical(other.logits)), axis=-1)

@@ -13,17 +13,17 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
-from jaxtyping import Array, Bool, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from envs.base import Environment, Episode, Goals, Task
-from envs.errors import DataError, UsageError
+from envs.errors import DataError, NotAvailableError, UsageError
 from envs.registry import Judgement, World
 from envs.registry import find as find_world
 from mgpo_jax.adaptation import (
@@ -42,7 +42,7 @@ from mgpo_jax.progress import Progress
 from mgpo_jax.rollout import Query, rollout
 from mgpo_jax.sharding import device_mesh, fetch, is_key, on_devices, replicate, split
 from mgpo_jax.tasks import num_tasks
-from mgpo_jax.transformer import TransformerConfig
+from mgpo_jax.transformer import GoalTransformer, TransformerConfig
 from mgpo_jax.trees import numbered_leaves, with_leaves
 
 # Bytes of the agents' memories (key-value caches) in a group: what fits into the cache of a CPU's core, or
@@ -654,6 +654,76 @@ def evaluate_fully(
     Raises:
       DataError: if the policy was made for another world, or a return is not finite.
     """
+    run = partial(_measurement, num_episodes=episodes)
+    return _of_queries(run, env, policy, tasks, queries, seed)
+
+
+class Uncertainty(NamedTuple):
+    """How sure a policy was of its actions in its own episodes."""
+
+    entropy: Float[Array, "*batch"]
+    """Of the distributions that it acted from, in nats, mean over the steps of the episode; NaN where the
+    policy's head has no closed form of it."""
+    return_: Float[Array, "*batch"]
+    num_steps: Int[Array, "*batch"]
+
+
+def uncertainty(
+    env: Environment, policy: LoadedPolicy, tasks: Task, queries: Query, *, seed: int = 0
+) -> Uncertainty:
+    """How sure a policy is of its actions under each query, in one fresh episode of it.
+
+    Args:
+      env: the world.
+      policy: who acts.
+      tasks: N tasks, stacked.
+      queries: with leaves ``[S, N, ..]``.
+      seed: seed of the episodes.
+
+    Returns:
+      Numpy arrays [S, N].
+
+    Raises:
+      DataError: if the policy was made for another world, or a return is not finite.
+    """
+    return _of_queries(_uncertainty, env, policy, tasks, queries, seed)
+
+
+@cache
+def _uncertainty(env: Environment, network: TransformerConfig, layout: Layout) -> Any:
+    """``((lanes, queries), params) -> uncertainty``, compiled once a process."""
+
+    def measure(own: tuple[Lanes, Query], params: Any) -> Uncertainty:
+        lane, query = own
+        done = rollout(lane.key, env, transformer_policy(network, params), lane.task, query)
+        # One pass over the whole episode gives the same distributions as the steps did.
+        episode = done.trajectory
+        distribution: Any = GoalTransformer(network).apply(
+            params, query.prompt, episode.obs, episode.actions
+        )
+        real = jnp.arange(len(episode.obs)) < episode.length
+        try:
+            entropy = jnp.sum(jnp.where(real, distribution.entropy(), 0.0)) / episode.length
+        except NotAvailableError:
+            entropy = jnp.float32(jnp.nan)
+        return Uncertainty(entropy, done.return_, episode.length)
+
+    return _over_lanes(env, layout, measure)
+
+
+def _of_queries(
+    program: Callable,
+    env: Environment,
+    policy: LoadedPolicy,
+    tasks: Task,
+    queries: Query,
+    seed: int,
+) -> Any:
+    """What a program finds for queries with leaves ``[S, N, ..]``, as numpy arrays with these axes.
+
+    ``program(env, network, layout)`` is a function ``((lanes, queries), params) -> found`` over all lanes;
+    what it finds has a field ``return_``.
+    """
     check_fits(policy.config, env.spec)
     seeds, num = queries.prompt.mask.shape[:2]
     grid = Grid(variants=1, seeds=seeds, tasks=num)
@@ -664,7 +734,7 @@ def evaluate_fully(
         grid.lanes(layout, tasks, seed, {}),
         jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], flat),
     )
-    run = _measurement(env, policy.config, layout, episodes)
+    run = program(env, policy.config, layout)
     found = fetch(run(split(layout.mesh, own), replicate(layout.mesh, policy.params)))
     found = jax.tree.map(lambda rows: grid.shape(rows)[0], found)
     if not (finite := np.isfinite(found.return_)).all():

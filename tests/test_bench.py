@@ -6,12 +6,18 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+import envs
+from envs.errors import UsageError
+from experiments import measurements
 from experiments.bench import BenchConfig, main
 from experiments.measurements import sequence_flops
+from experiments.store.settings import pretrain_preset
+from mgpo_jax.kinds import kind_of
 from mgpo_jax.transformer import TransformerConfig
 
 CONFIG = TransformerConfig(obs_shape=(3, 2), goal_dim=2, action_dim=4, horizon=9, embed_dim=8)
@@ -54,3 +60,36 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert found["share of it"]["value"] < 100
     printed = capsys.readouterr().out
     assert all(name in printed for name in found)
+
+
+def test_baselines_without_a_released_network_start_from_random_weights() -> None:
+    """And what a world cannot have, such as a method whose check refuses it, has no row."""
+    world, env = envs.find("maze15"), envs.make("maze15")
+    dataset, _ = measurements.bench_collect(world, env, "astar2", 8)
+    recipe = pretrain_preset("maze15", "smoke", "spirl")
+    policy, note = measurements.policy_to_bench(world, env, recipe, dataset)
+    assert note == "untrained policy"
+    assert kind_of(policy.config).name == "spirl"
+
+
+def test_rows_of_baselines_are_per_episode_of_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def adapt(env, policy, tasks, method, hyper, *, seeds, episodes, eval_every):
+        asked.append((policy, method.name, seeds, episodes, eval_every))
+        if method.name == "ptgm":
+            raise UsageError("no goals to choose from")
+        returns = np.zeros((seeds, 4, episodes))
+        return SimpleNamespace(cpu_seconds=8.0, returns=returns, lengths=returns + 30)
+
+    monkeypatch.setattr(measurements, "adapt", adapt)
+    monkeypatch.setattr(
+        measurements, "policy_to_bench", lambda world, env, recipe, dataset: (recipe.method, "made")
+    )
+    world, env = envs.find("gridworld"), envs.make("gridworld")
+    rows = list(measurements.bench_baselines(world, env, "gridworld", None, 40))
+    assert [row.name for row in rows] == ["adapt reinforce", "adapt ppo", "adapt spirl"]
+    assert [row.value for row in rows] == [1e3 * 8 / 160] * 3
+    assert rows[0].note == "made, 4 tasks x 40 episodes of 30 steps"
+    assert [kind for kind, *_ in asked] == ["mgpo", "mgpo", "ptgm", "spirl"]
+    assert {tuple(rest) for _, _, *rest in asked} == {(1, 40, 40)}

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import special, stats
 
+from envs.errors import NotAvailableError
 from mgpo_jax.distributions import HEADS, Binned, Categorical, Gaussian, Mixture
 
 LOGITS = np.array([0.3, -1.2, 2.0, 0.0, -0.4], np.float32)
@@ -282,3 +283,32 @@ def test_temperature_0_in_the_limit_is_the_mode(name):
         if name == "binned":
             expected = np.linspace(-1, 1, 41)[np.asarray(cold.logits).argmax(axis=-1)]
         np.testing.assert_allclose(actions, np.broadcast_to(expected, actions.shape), atol=width)
+
+
+def test_entropies_against_scipy():
+    """Two distributions at once; of the binned one, those of its two histograms together."""
+    logits = np.stack([LOGITS, 3 * LOGITS[::-1]])
+    found = Categorical(jnp.asarray(logits)).entropy()
+    np.testing.assert_allclose(
+        found, stats.entropy(special.softmax(logits, axis=1), axis=1), rtol=1e-5
+    )
+    log_stds = np.stack([LOG_STD, LOG_STD - 3])
+    found = Gaussian(jnp.zeros((2, 2)), jnp.asarray(log_stds)).entropy()
+    expected = stats.norm.entropy(scale=np.exp(log_stds)).sum(axis=1)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    edges = np.linspace(-1.25, 1.25, 6)  # five values half a unit apart
+    histograms = [
+        stats.rv_histogram((special.softmax(row), edges), density=False) for row in logits
+    ]
+    expected = sum(float(histogram.entropy()) for histogram in histograms)
+    np.testing.assert_allclose(Binned(jnp.asarray(logits)).entropy(), expected, rtol=1e-4)
+
+
+def test_sure_choices_have_no_entropy():
+    sure = Categorical(jnp.array([0.0, 1e4, -1e4]))
+    assert float(sure.entropy()) == 0.0
+
+
+def test_a_mixture_says_that_it_has_no_closed_form():
+    with pytest.raises(NotAvailableError, match="the entropy of a mixture has no closed form"):
+        a_mixture().entropy()

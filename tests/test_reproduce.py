@@ -12,13 +12,14 @@ import pytest
 
 import envs
 from envs import episodes
-from envs.errors import DataError, UsageError
-from experiments import ablations, comparisons
+from envs.errors import DataError, NotAvailableError, UsageError
+from experiments import ablations, comparisons, inventory, reproduce, robustness
 from experiments.reproduce import main
 from experiments.store import settings as store_settings
 from experiments.store.paper import paper_worlds
 from experiments.store.results import load_results
 from experiments.store.settings import PretrainConfig, ReproduceConfig, pretrain_preset
+from experiments.store.summary import read_summary
 from mgpo_jax import methods
 from mgpo_jax.settings import check_settings
 from mgpo_jax.tasks import test_tasks as released_tasks
@@ -82,20 +83,21 @@ def test_a_stopped_training_goes_on(tiny: Path, monkeypatch: pytest.MonkeyPatch)
     asked: list[PretrainConfig] = []
     monkeypatch.setattr(ablations, "train", lambda settings, go_on: asked.append(settings))
     config = ReproduceConfig(what="figure8", steps=2)
-    policy = ablations.trained(config, "astar4", "astar4", max_prompt_length=10)
+    longer = ablations.planned(config, "astar4", "astar4", max_prompt_length=10)
+    policy = ablations.trained(longer)
     policy.parent.mkdir(parents=True)
     (policy.parent / "config.json").touch()
-    ablations.trained(config, "astar4", "astar4", max_prompt_length=10)
+    ablations.trained(longer)
     assert [one.resume for one in asked] == [False, True]  # it goes on where it was
     for one in asked:
         assert (one.out, one.max_prompt_length) == (policy.parent, 10)
         assert (one.data.demonstrator, one.train.steps) == ("astar4", 2)
     policy.mkdir()
-    ablations.trained(config, "astar4", "astar4", max_prompt_length=10)
+    ablations.trained(longer)
     assert len(asked) == 3  # the policy is only half there
     for name in ("policy/config.json", "policy/weights.npz", "training.png"):
         (policy.parent / name).touch()
-    ablations.trained(config, "astar4", "astar4", max_prompt_length=10)
+    ablations.trained(longer)
     assert len(asked) == 3
 
 
@@ -106,7 +108,7 @@ def test_heads_differ_in_nothing_else(tiny: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(
         ablations, "adapted", lambda config, policy, folders: adapted.extend(folders)
     )
-    lines = ablations.heads(ReproduceConfig(what="heads", env=("kitchen",), steps=2))
+    lines = ablations.make(ReproduceConfig(what="heads", env=("kitchen",), steps=2))
     assert [line.label for line in lines] == ["gaussian", "fixed_gaussian", "mixture", "binned"]
     assert [line.results for line in lines] == adapted
     assert [one.head for one in asked] == [line.label for line in lines]
@@ -115,7 +117,10 @@ def test_heads_differ_in_nothing_else(tiny: Path, monkeypatch: pytest.MonkeyPatc
     assert same.pop().data.trajectories == 9_000
 
 
-def test_a_comparison_from_cells_to_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_table1_from_cells_to_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """``reproduce table1 --scale smoke`` with two tasks and two episodes, and then once more."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(comparisons, "SMOKE_TASKS", 2)
     monkeypatch.setattr(comparisons, "SMOKE_EPISODES", 2)
@@ -132,9 +137,10 @@ def test_a_comparison_from_cells_to_table(tmp_path: Path, monkeypatch: pytest.Mo
         what="table1", env=("maze15",), scale="smoke", only=("gcbc", "explore")
     )
     with pytest.raises(UsageError, match="method of table1"):
-        comparisons.compare(config)
+        main(config)
     config = replace(config, only=("gcbc", "ucb", "ptgm"))
-    text = comparisons.compare(config)
+    main(config)
+    text = capsys.readouterr().out
     _, _, *rows = [line for line in text.splitlines() if line.startswith("|")]
     gcbc, ucb, ptgm = ([cell.strip() for cell in row.strip("|").split("|")] for row in rows)
     assert [row[:2] for row in (gcbc, ucb, ptgm)] == [
@@ -147,22 +153,27 @@ def test_a_comparison_from_cells_to_table(tmp_path: Path, monkeypatch: pytest.Mo
     assert "- maze15: no policy in that folder" in text
     assert "Scaled down: 2 tasks, 1 seed, 2 episodes" in text
     assert comparisons.files_of(config)[1].stat().st_size > 0
+    (row,) = [line for line in inventory.inventory(config).splitlines() if "| table1 |" in line]
+    assert row.startswith("| table1 | maze15 | 2 of 3 | 0.0 | ")
 
     def never(*args: Any, **options: Any) -> None:
         raise AssertionError("what is finished was done again")
 
     monkeypatch.setattr(comparisons, "adapt_and_save", never)
-    assert comparisons.compare(config) == text
+    main(config)
+    assert capsys.readouterr().out == text
 
 
 def test_published_cells_are_used_if_they_are_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = comparisons.cell_config(ReproduceConfig(what="table2"), "maze15", "ucb")
-    assert comparisons.published(settings) == Path("results/maze15/ucb")
-    assert comparisons.published(replace(settings, seeds=2)) is None
+    config = ReproduceConfig(what="table2")
+    settings = comparisons.cell_config(config, "maze15", "ucb")
+    assert comparisons.published(config, settings) == Path("results/maze15/ucb")
+    assert comparisons.published(config, replace(settings, seeds=2)) is None
+    assert comparisons.published(replace(config, scale="paper"), settings) is None
     monkeypatch.chdir(tmp_path)
-    assert comparisons.published(settings) is None
+    assert comparisons.published(config, settings) is None
 
 
 def test_figures_are_drawn_of_published_results(
@@ -184,7 +195,8 @@ def test_every_method_of_a_comparison_is_known() -> None:
     for name, comparison in comparisons.TABLES.items():
         for method in (*comparison.methods, *comparison.further):
             assert methods.find(method).name == method
-        assert set(paper_worlds(name)) >= {"maze15", "maze30", "kitchen", "gridworld"}
+        four = {"maze15", "maze30", "kitchen", "gridworld"}
+        assert set(paper_worlds(name)) >= ({"kitchen"} if name == "table3" else four)
 
 
 @pytest.mark.parametrize(
@@ -199,6 +211,9 @@ def test_every_method_of_a_comparison_is_known() -> None:
         (ReproduceConfig(what="table5", only=("astar3",)), "did you mean 'astar"),
         (ReproduceConfig(what="figure8", only=("41",)), "row of figure8"),
         (ReproduceConfig(what="table4", steps=0), "--steps must be at least 1"),
+        (ReproduceConfig(what="all", only=("ucb",)), "all has no use for --only"),
+        (ReproduceConfig(what="figure11", steps=5), "figure11 has no use for --steps 5"),
+        (ReproduceConfig(what="table3", only=("reinforce",)), "unknown method of table3"),
         (ReproduceConfig(what="table1", steps=5), "table1 has no use for --steps 5"),
         (ReproduceConfig(what="table4", scale="smoke"), "table4 has no use for --scale smoke"),
         (ReproduceConfig(what="table1", env=("maze51",)), "did you mean 'maze15'"),
@@ -236,7 +251,7 @@ def test_table4_varies_length_and_constant(tiny: Path, monkeypatch: pytest.Monke
         asked.update(folders)
 
     monkeypatch.setattr(ablations, "adapted", adapted)
-    lines = ablations.table4(ReproduceConfig(what="table4"))
+    lines = ablations.make(ReproduceConfig(what="table4"))
     assert [line.label for line in lines] == [
         "K = 1", "K = 2", "K = 3", "K = 5", "c = 0", "c = 1", "c = 10",
     ]  # fmt: skip
@@ -246,3 +261,96 @@ def test_table4_varies_length_and_constant(tiny: Path, monkeypatch: pytest.Monke
     assert all(hyper.scale == 1 for hyper in hypers[4:])  # Eq. 3 as printed
     assert all(hyper.scale is None for hyper in hypers[:4])
     assert (lines[0].paper, lines[3].paper) == ("-2.63 ± 0.00", "-0.41 ± 0.10")
+
+
+def test_all_goes_on_after_a_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made: list[tuple[str, tuple[str, ...]]] = []
+
+    def make(config: ReproduceConfig) -> None:
+        made.append((config.what, config.env))
+        if config.what == "table2":
+            raise UsageError("no room")
+        if config.what == "table5":
+            raise NotAvailableError("one demonstrator")
+
+    monkeypatch.setattr(reproduce, "make", make)
+    config = ReproduceConfig(what="all", env=("gridworld", "maze15"), out=tmp_path)
+    with pytest.raises(DataError, match=r"^1 of \d+ could not be made: table2 gridworld maze15; "):
+        reproduce.make_all(config)
+    both = ("gridworld", "maze15")
+    assert [what for what, env in made if env == both] == [
+        "table1", "table2", "table3", "table8", "figure6", "figure7", "figure11",
+    ]  # fmt: skip
+    one_by_one = {what for what, env in made if env == ("maze15",)}
+    assert one_by_one == {
+        "figure2", "figure3", "figure5", "figure9", "figure10", "table4", "table5", "figure8", "heads",
+    }  # fmt: skip
+    said = capsys.readouterr().err
+    assert "table2 gridworld maze15 failed: no room" in said
+    assert "table5 maze15 is left out: one demonstrator" in said
+
+    assert "table4" not in {job.what for job in inventory.jobs(replace(config, scale="smoke"))}
+
+
+def test_all_has_the_worlds_of_the_paper() -> None:
+    jobs = inventory.jobs(ReproduceConfig(what="all"))
+    worlds = {job.what: [] for job in jobs}
+    for job in jobs:
+        worlds[job.what] += job.env
+    assert worlds["table1"] == []  # those of the paper, in one table
+    assert worlds["table4"] == ["maze15", "maze30", "kitchen"]
+    assert worlds["figure8"] == ["maze15", "maze30"]
+    assert worlds["heads"] == ["kitchen"]
+
+
+def test_the_inventory_counts_prices_and_doubts(tmp_path: Path) -> None:
+    config = ReproduceConfig(what="list", env=("maze15",), out=tmp_path)
+    rows = {
+        row[0]: row[1:]
+        for line in inventory.inventory(config).splitlines()[2:]
+        for row in [[cell.strip() for cell in line.strip("|").split("|")]]
+    }
+    assert rows["table2"][:2] == ["maze15", "5 of 5"]  # all published
+    assert rows["table2"][3] == ""
+    assert rows["table1"][1] == "3 of 11"
+    # GC-BC acts for next to nothing; of SPiRL and PTGM nothing is published that tells a price.
+    assert rows["table1"][3] == "0.0 + ?"
+    spent = read_summary(Path("results/maze15/ucb"))["cpu_seconds"]
+    assert rows["figure3"][1:3] == ["1 of 1", f"{spent / 60:.1f}"]
+    assert rows["table3"][1] == "0 of 35"
+    assert rows["table5"][1] == "0 of 4"
+    # Four trainings of 2,000 steps at the speed of the released policy, and four times UCB.
+    assert 4 * 2_000 * 0.2 / 60 < float(rows["table5"][3]) < 4 * (2_000 * 0.4 + 2 * spent) / 60
+    assert rows["heads"][1] == "-"
+    assert "no heads for maze15" in rows["heads"][3]
+    assert rows["figure11"][1] == "0 of 1"
+
+
+def test_prices_are_those_of_relatives() -> None:
+    rate = inventory.seconds_per_episode
+    ucb = 1 / read_summary(Path("results/maze15/ucb"))["episodes_per_cpu_second"]
+    assert rate("maze15", methods.find("ucb")) == pytest.approx(ucb)
+    assert rate("gridworld", methods.find("ppo")) == rate("gridworld", methods.find("reinforce"))
+    assert rate("gridworld", methods.find("spirl")) is None
+    assert rate("gridworld", methods.find("gcbc")) == min(
+        1 / read_summary(path)["episodes_per_cpu_second"]
+        for path in Path("results/gridworld").iterdir()
+        if path.name in methods.names()
+    )
+    assert rate("crafter", methods.find("ucb")) is None
+
+
+def test_table3_by_the_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def never(*args: Any, **options: Any) -> None:
+        raise AssertionError("what is published was done again")
+
+    monkeypatch.setattr(comparisons, "adapt_and_save", never)
+    monkeypatch.setattr(robustness, "open_case", never)
+    main(ReproduceConfig(what="table3", env=("kitchen-stock",), only=("bpe",), out=tmp_path))
+    printed = capsys.readouterr()
+    assert "| kitchen-stock | MGPO-BPE | observations 0.01 | 0.45 (-0.20) | 0.9" in printed.out
+    assert printed.err.strip() == f"table in {tmp_path / 'table3-cpu.md'}"

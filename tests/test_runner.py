@@ -12,17 +12,18 @@ import pytest
 
 from envs.base import ArraySpec, Box, Engine, Environment, EnvSpec, TimeStep
 from envs.episodes import replay
-from envs.errors import DataError, UsageError
+from envs.errors import DataError, NotAvailableError, UsageError
 from envs.gridworld.env import GridWorld
 from envs.maze.env import MazeRunner
 from envs.registry import Judgement
 from envs.wrappers import Noisy, Wrapper
 from mgpo_jax import runner
 from mgpo_jax.adaptation import Adapter
+from mgpo_jax.distributions import Categorical
 from mgpo_jax.methods import GCBC, UCB, Method, NoHyper, UcbHyper
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.prompts import Prompt, single_goal
-from mgpo_jax.rollout import Query
+from mgpo_jax.rollout import Query, rollout
 from mgpo_jax.runner import (
     _lay_out,
     adapt,
@@ -32,6 +33,7 @@ from mgpo_jax.runner import (
     lanes_together,
     play,
     sweep,
+    uncertainty,
 )
 from mgpo_jax.settings import NotNegative
 from mgpo_jax.tasks import sample_tasks, task_at
@@ -558,3 +560,43 @@ def test_methods_say_what_they_cannot_do(tasks):
 def test_judgements_that_say_nothing(changes):
     with pytest.raises(UsageError, match="judged at a temperature above 0 in at least one episode"):
         Judgement("sample", **changes)
+
+
+def test_uncertainty_is_that_of_the_steps_of_the_episode(tasks):
+    """Step by step, with the policy's own decoding, along the episodes that the runner plays."""
+    policy, num = untrained(MAZE), len(tasks.goal)
+    prompts = jax.vmap(lambda task: single_goal(MAZE.task_goal(task), 3))(tasks)
+    query = jax.tree.map(lambda leaf: leaf[None], Query(prompts, jnp.zeros(num, bool)))
+    found = uncertainty(MAZE, policy, tasks, query, seed=3)
+    assert found.entropy.shape == found.return_.shape == found.num_steps.shape == (1, num)
+    for index, key in enumerate(jax.random.split(jax.random.key(3), num)):
+        own = jax.tree.map(lambda leaf, index=index: leaf[0, index], query)
+        task = task_at(tasks, index)
+        episode = rollout(key, MAZE, policy.policy, task, own)
+        length, entropies = int(episode.trajectory.length), []
+        distribution, carry = policy.policy.prefill(own.prompt, episode.trajectory.obs[0])
+        carry = policy.policy.grow(carry, MAZE.spec.horizon)
+        for time in range(length):
+            if time:
+                before = episode.trajectory.actions[time - 1]
+                distribution, carry = policy.policy.decode(
+                    carry, before, episode.trajectory.obs[time]
+                )
+            entropies.append(float(distribution.entropy()))
+        assert found.num_steps[0, index] == length
+        assert found.return_[0, index] == pytest.approx(float(episode.return_))
+        assert found.entropy[0, index] == pytest.approx(np.mean(entropies), rel=1e-4)
+
+
+def test_a_head_without_entropy_leaves_it_unknown(monkeypatch, tasks):
+    def none(distribution):
+        raise NotAvailableError("no closed form")
+
+    monkeypatch.setattr(Categorical, "entropy", none)
+    prompts = jax.vmap(lambda task: single_goal(MAZE.task_goal(task), 3))(tasks)
+    query = Query(prompts, jnp.zeros(len(tasks.goal), bool))
+    runner._uncertainty.cache_clear()
+    found = uncertainty(MAZE, untrained(MAZE), tasks, jax.tree.map(lambda leaf: leaf[None], query))
+    runner._uncertainty.cache_clear()
+    assert np.isnan(found.entropy).all()
+    assert np.isfinite(found.return_).all()

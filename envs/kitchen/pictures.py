@@ -24,9 +24,9 @@ NO_BREAK = "\N{NO-BREAK SPACE}"  # keeps a goal of several subtasks on one line
 
 
 def kitchen_pictures(env: Kitchen) -> Pictures:
-    """A GIF of one task; all engines of the kitchen look the same."""
+    """A GIF of one task, and a still of the scene; all engines of the kitchen look the same."""
     del env
-    return Pictures(video=write_video, another_order=True)
+    return Pictures(video=write_video, frame=kitchen_frame, another_order=True)
 
 
 def write_video(path: Path, task: Task, shown: Sequence[Shown]) -> None:
@@ -74,6 +74,11 @@ def kitchen_frames(
             renderer.update_scene(data, camera)
             renderer.render(out=frame)
     return frames
+
+
+def kitchen_frame(obs: Float[np.ndarray, "59"]) -> UInt8[np.ndarray, "H W 3"]:
+    """What the scene looks like at one observation; raises as ``kitchen_frames``."""
+    return kitchen_frames(np.asarray(obs)[None])[0]
 
 
 class Panel(NamedTuple):

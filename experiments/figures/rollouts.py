@@ -15,15 +15,16 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from envs.base import Episode, Task
+from envs.base import Episode, Goals, Task
 from envs.drawing import Film, Pictures, Shown, Stage, observations, write_films
 from experiments.figures.style import method_styles, styled
 from experiments.store.settings import file_name
-from mgpo_jax.prompts import sample_prompt
+from mgpo_jax.prompts import Prompt, goals_of, sample_prompt
 
 if TYPE_CHECKING:
     from experiments.store.results import Results
@@ -276,11 +277,25 @@ def longest_prompt(
     """The longest of some prompts ``[k, G]`` that are drawn from the best of a batch of episodes."""
     best = int(np.argmax(episodes.return_))
     reached = jax.tree.map(lambda leaf: jnp.asarray(leaf[best]), episodes.trajectory.goals)
-    draw = jax.jit(jax.vmap(lambda k: sample_prompt(k, reached, jnp.asarray(goal), max_goals)))
-    drawn = draw(jax.random.split(key, NUM_DRAWS))
-    mask = np.asarray(drawn.mask)
-    longest = int(mask.sum(axis=1).argmax())
-    return np.asarray(drawn.goals)[longest][mask[longest]]
+    draw = jax.jit(draw_longest, static_argnames="num_slots")
+    return goals_of(draw(key, reached, jnp.asarray(goal), max_goals, num_slots=max_goals))
+
+
+def draw_longest(
+    key: PRNGKeyArray,
+    reached: Goals,
+    goal: Float[Array, "G"],
+    max_goals: int | Int[Array, ""],
+    num_slots: int,
+) -> Prompt:
+    """The longest of some prompts of at most ``max_goals`` goals that the one sampler draws.
+
+    Nearly always it has so many, if the trajectory reached enough of them.
+    """
+    keys = jax.random.split(key, NUM_DRAWS)
+    drawn = jax.vmap(lambda k: sample_prompt(k, reached, goal, num_slots, max_goals))(keys)
+    longest = jnp.argmax(drawn.mask.sum(axis=1))
+    return jax.tree.map(lambda leaf: leaf[longest], drawn)
 
 
 def _has_prompts(result: Results) -> bool:

@@ -60,9 +60,9 @@ def title_of(method: str) -> str:
         return method
 
 
-def plain(text: str) -> str:
+def plain(text: str, longest: int = 60) -> str:
     """A text from a file as a picture shows it: on one line, not too long, and never as a formula."""
-    return shortened(printable(text)).replace("$", r"\$")
+    return shortened(printable(text), longest).replace("$", r"\$")
 
 
 METHODS = {

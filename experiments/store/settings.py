@@ -462,13 +462,14 @@ class ReproduceConfig(Common):
     """Settings of ``experiments.reproduce``."""
 
     what: tyro.conf.Positional[str] = ""
-    """table1, table2, table8 (methods in all worlds), figure6, figure7 (the same with their curves),
-    figure2, figure3, figure5, figure9, figure10 (prompts and what is done under them), table4 (prompt
-    length and c of UCB), table5 (datasets), figure8 (longer prompts), heads (distributions of continuous
-    actions), or list (what each costs and what is there)."""
+    """table1, table2, table8 (methods in all worlds), figure6, figure7 (the same with their curves), table3
+    (optimized prompts behind noise), figure2, figure3, figure5, figure9, figure10 (prompts and what is done
+    under them), figure11 (the worlds at a glance), table4 (prompt length and c of UCB), table5 (datasets),
+    figure8 (longer prompts), heads (distributions of continuous actions), list (what is there of each, and
+    what the rest costs), or all (everything that is missing)."""
     env: tuple[Name, ...] = ()
-    """The worlds, by name or as module:attribute (default: those of the paper's table; of an ablation,
-    maze15)."""
+    """The worlds, by name or as module:attribute (default: those of the paper's table or figure; of an
+    ablation, maze15; of figure11, all)."""
     scale: Literal["smoke", "cpu", "paper"] = "cpu"
     """Of what compares methods or draws adaptations: cpu has the released networks and the paper's budget,
     smoke five tasks, one seed and 20 episodes, and paper networks that are trained by the preset of that
@@ -507,29 +508,39 @@ class ReproduceConfig(Common):
         return envs.find(self.world).presets.get("ablation", {}).get(name, default)
 
 
-COMPARISONS = ("table1", "table2", "table8", "figure6", "figure7")
+COMPARISONS = ("table1", "table2", "table3", "table8", "figure6", "figure7")
 """What ``experiments.reproduce`` makes of several methods in several worlds."""
 PICTURES = ("figure2", "figure3", "figure5", "figure9", "figure10")
 """What it draws of adaptations."""
+ABLATIONS = ("table4", "table5", "figure8", "heads")
+"""What it trains for."""
+GLANCE = "figure11"
+"""The picture of all worlds."""
+LIST, ALL = "list", "all"
 
 
 def check_reproduction(config: ReproduceConfig) -> None:
     """Raise ``UsageError`` for settings of ``experiments.reproduce`` that do not go together."""
-    if config.what in (*COMPARISONS, *PICTURES):
-        for name in ("steps", "trajectories"):
-            if value := getattr(config, name):
-                raise UsageError(
-                    f"{config.what} has no use for {flag(name)} {shown(value)}; leave it out"
-                )
+    if config.what not in ABLATIONS:
+        useless = ["steps", "trajectories"]
+        useless += ["only"] if config.what not in COMPARISONS else []
+        _refuse(config, useless)
         return
     if config.scale != "cpu":
         raise UsageError(f"{config.what} has no use for --scale {config.scale}; leave it out")
     if config.what == "table4":  # which trains nothing
-        for name in ("only", "steps", "trajectories"):
-            if value := getattr(config, name):
-                raise UsageError(f"table4 has no use for {flag(name)} {shown(value)}; leave it out")
+        _refuse(config, ("only", "steps", "trajectories"))
     elif config.num_trajectories <= (kept := pretrain_preset(config.world, "fast").holdout):
         raise UsageError(
             f"--trajectories must be above {kept}, the trajectories kept out of training, found "
             f"{config.num_trajectories}"
         )
+
+
+def _refuse(config: ReproduceConfig, names: Iterable[str]) -> None:
+    """Raise ``UsageError`` for the first of some settings that is given and has no use."""
+    for name in names:
+        if value := getattr(config, name):
+            raise UsageError(
+                f"{config.what} has no use for {flag(name)} {shown(value)}; leave it out"
+            )

@@ -1,0 +1,246 @@
+"""What there is of all that ``experiments.reproduce`` makes, what it took, and what the missing costs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+from math import ceil
+from pathlib import Path
+from typing import NamedTuple
+
+import envs
+from envs.errors import DataError, UsageError
+from experiments import ablations, glance, robustness
+from experiments.comparisons import (
+    PICTURES,
+    PUBLISHED,
+    SMOKE_TASKS,
+    Cell,
+    cell_config,
+    methods_of,
+    num_seeds,
+    published,
+    worlds_of,
+)
+from experiments.store import runs
+from experiments.store.metrics import METRICS, read_metrics
+from experiments.store.settings import (
+    ABLATIONS,
+    COMPARISONS,
+    DEFAULT_WORLD,
+    GLANCE,
+    AdaptConfig,
+    PretrainConfig,
+    ReproduceConfig,
+    file_name,
+)
+from experiments.store.summary import read_summary
+from experiments.store.tables import table
+from mgpo_jax import methods
+from mgpo_jax.methods import Method
+from mgpo_jax.released import released_folder
+
+HEAD = (
+    "what",
+    "world",
+    "cells there",
+    "CPU-minutes of those",
+    "CPU-minutes of the missing (estimate)",
+)
+
+
+class Piece(NamedTuple):
+    """A cell, or a training: whether it is there, and what it took or would take."""
+
+    there: bool
+    seconds: float | None
+    """CPU time; None if nothing is known that it could be estimated from."""
+    counts: bool = True
+    """Whether it is a cell of the table; a training only has a price."""
+
+
+def jobs(config: ReproduceConfig) -> list[ReproduceConfig]:
+    """What ``reproduce all`` makes, one after the other, with the worlds of each.
+
+    Tables of methods have all worlds in one table, everything else is made in one world at a time. Only the
+    scale ``cpu`` has ablations, whose trainings have budgets of their own.
+    """
+    scaled = ABLATIONS if config.scale == "cpu" else ()
+    tables = [replace(config, what=name) for name in COMPARISONS]
+    by_world = [
+        replace(config, what=name, env=(world,))
+        for name in (*PICTURES, *scaled)
+        for world in worlds_of_job(replace(config, what=name))
+    ]
+    return [*tables, *by_world, replace(config, what=GLANCE)]
+
+
+def worlds_of_job(config: ReproduceConfig) -> Sequence[str]:
+    """The worlds of a table, figure or ablation: those asked for, or the paper's, or the default one."""
+    return worlds_of(config) or (DEFAULT_WORLD,)
+
+
+def inventory(config: ReproduceConfig) -> str:
+    """What there is of each table, figure and ablation in each world, and what it takes, in Markdown."""
+    rows = []
+    for job in jobs(config):
+        if job.what == GLANCE:
+            there = glance.file_of(job).is_file()
+            rows.append([GLANCE, "all that are installed", f"{int(there)} of 1", "", ""])
+            continue
+        for world in worlds_of_job(job):
+            try:
+                pieces = list(pieces_of(job, world))
+            except UsageError as error:
+                rows.append([job.what, world, "-", "", str(error)])
+                continue
+            rows.append([job.what, world, *told(pieces)])
+    return table(HEAD, rows)
+
+
+def told(pieces: Sequence[Piece]) -> tuple[str, str, str]:
+    """How many cells are there, the minutes of what is there, and an estimate for what is not."""
+    cells = [piece for piece in pieces if piece.counts]
+    spent = sum(piece.seconds or 0.0 for piece in pieces if piece.there) / 60
+    missing = [piece.seconds for piece in pieces if not piece.there]
+    known = [seconds for seconds in missing if seconds is not None]
+    estimate = [f"{sum(known) / 60:.1f}"] if known else []
+    estimate += ["?"] if len(known) < len(missing) else []
+    have = sum(piece.there for piece in cells)
+    return f"{have} of {len(cells)}", f"{spent:.1f}", " + ".join(estimate)
+
+
+def pieces_of(config: ReproduceConfig, world: str) -> Iterator[Piece]:
+    """The cells of a table, figure or ablation in one world, and the trainings that they need.
+
+    Raises:
+      UsageError: if there is nothing like it in this world.
+    """
+    if config.what in ablations.PLANS:
+        yield from _of_ablation(replace(config, env=(world,)))
+        return
+    names = PICTURES[config.what].methods if config.what in PICTURES else methods_of(config)
+    for name in names:
+        cell, piece = _cell(config, world, name)
+        if config.what != "table3":
+            yield piece
+            continue
+        yield piece._replace(counts=False)
+        yield from _behind_noise(config, cell)
+
+
+def _cell(config: ReproduceConfig, world: str, method: str) -> tuple[Cell, Piece]:
+    settings = cell_config(config, world, method)
+    folder = settings.folder if settings.folder.is_dir() else published(config, settings)
+    if folder is not None:
+        piece = Piece(True, read_summary(folder)["cpu_seconds"])
+    elif settings.policy is not None and not runs.is_finished(settings.policy.parent):
+        piece = Piece(False, None)  # what the training of its policy takes is not known
+    else:
+        piece = Piece(False, _estimate(config, settings))
+    return Cell(world, method, folder), piece
+
+
+def _behind_noise(config: ReproduceConfig, cell: Cell) -> Iterator[Piece]:
+    rate = seconds_per_episode(cell.world, methods.find(cell.method))
+    episodes = _num_tasks(config, cell.world) * num_seeds(config)
+    episodes *= robustness.num_episodes(config)
+    for noise in robustness.sizes_of(config):
+        if (found := robustness.known(config, cell, noise)) is not None:
+            yield Piece(True, found.cpu_seconds)
+        else:
+            yield Piece(False, None if rate is None else rate * episodes)
+
+
+def _of_ablation(config: ReproduceConfig) -> Iterator[Piece]:
+    trainings: dict[Path, PretrainConfig] = {}
+    for part in ablations.PLANS[config.what](config):
+        if part.training is not None:
+            trainings[part.training.folder] = part.training
+        if part.results.is_dir():
+            yield Piece(True, read_summary(part.results)["cpu_seconds"])
+        else:
+            settings = AdaptConfig(
+                env=config.world, seeds=config.seeds, episodes=ablations.EPISODES, hyper=part.hyper
+            )
+            yield Piece(False, _estimate(config, settings))
+    for folder, training in trainings.items():
+        done = runs.is_finished(folder)
+        price = _seconds_in(folder) if done else _price_of(training)
+        yield Piece(done, price, counts=False)
+
+
+def _price_of(training: PretrainConfig) -> float | None:
+    """CPU-seconds of a training at the speed of the released policy's; None where there is none."""
+    place = released_folder(envs.find(training.env))
+    seconds, steps = _seconds_in(place), _steps_in(place)
+    return None if seconds is None or not steps else seconds / steps * training.train.steps
+
+
+def _seconds_in(folder: Path) -> float | None:
+    """CPU-seconds of the steps of a training, from its metrics; None if they do not tell them."""
+    rows = _metrics(folder)
+    if not rows or any("cpu_seconds_per_step" not in row for row in rows):
+        return None
+    before = [0, *(row["step"] for row in rows[:-1])]
+    return sum(
+        row["cpu_seconds_per_step"] * (row["step"] - start)
+        for row, start in zip(rows, before, strict=True)
+    )
+
+
+def _steps_in(folder: Path) -> int:
+    rows = _metrics(folder)
+    return int(rows[-1]["step"]) if rows else 0
+
+
+def _metrics(folder: Path) -> list[dict[str, float]]:
+    try:
+        return read_metrics(folder / METRICS)
+    except DataError:
+        return []
+
+
+def _num_tasks(config: ReproduceConfig, world: str) -> int:
+    return SMOKE_TASKS if config.scale == "smoke" else envs.find(world).num_test_tasks
+
+
+def _estimate(config: ReproduceConfig, settings: AdaptConfig) -> float | None:
+    """CPU-seconds of an adaptation at the speed of published ones; None where there are none like it."""
+    world = envs.find(settings.env)
+    rate = seconds_per_episode(settings.env, methods.find(settings.method))
+    judgements = 1 + ceil(settings.episodes / settings.eval_every)
+    episodes = settings.episodes + judgements * world.judged.episodes
+    lanes = settings.seeds * _num_tasks(config, settings.env)
+    return None if rate is None else rate * episodes * lanes
+
+
+def seconds_per_episode(world: str, method: Method) -> float | None:
+    """CPU-seconds of an episode in the published adaptations of a world; None where none is like it.
+
+    Those of the same method count, else the mean of those that learn in the same way. A method that learns
+    nothing only acts: it costs at most what the cheapest of all does.
+    """
+    rates = _rates_in((PUBLISHED / file_name(world)).absolute())
+    if method.name in rates:
+        return rates[method.name]
+    if not method.learns:
+        return min(rates.values(), default=None)
+    alike = [rate for name, rate in rates.items() if way_of(methods.find(name)) == way_of(method)]
+    return sum(alike) / len(alike) if alike else None
+
+
+def way_of(method: Method) -> tuple[str, type]:
+    """How a method learns: the kind of its network, and the hyper-parameters that its relatives share."""
+    return method.policy, method.hyper.__mro__[-2]  # the last one is object
+
+
+@cache
+def _rates_in(folder: Path) -> Mapping[str, float]:
+    """CPU-seconds of an episode in the adaptations that a folder holds, by the names of their methods."""
+    return {
+        name: 1 / read_summary(folder / file_name(name))["episodes_per_cpu_second"]
+        for name in methods.names()
+        if (folder / file_name(name)).is_dir()
+    }

@@ -1,0 +1,171 @@
+"""Figure 9 in numbers: how sure the policy is of its actions, and its return, by the length of the prompt.
+
+Prompts of 1, 2, .. K goals are drawn from the best trajectory of each search by the one sampler, as the
+search itself draws new ones, and the policy acts under each in an episode of its own with sampled actions.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+import envs
+from envs.base import Goals
+from experiments.figures import draw_longest
+from experiments.store.policies import load_policy_of
+from experiments.store.results import Results
+from experiments.store.statistics import SeedSpread, seed_spread
+from experiments.store.tables import number, table
+from mgpo_jax.prompts import Prompt
+from mgpo_jax.rollout import Query
+from mgpo_jax.runner import uncertainty
+
+DRAWS = 2  # prompts of each length from each trajectory
+HEAD = (
+    "goals", "prompts", "entropy of an action (mean ± std over seeds)", "return", "steps",
+)  # fmt: skip
+
+
+class Length(NamedTuple):
+    """What prompts of one length make of the policy."""
+
+    num_goals: int
+    num_prompts: int
+    entropy: SeedSpread | None
+    """Of the distribution of one action, in nats; None where the policy's head has no closed form."""
+    return_: float
+    num_steps: float
+    """Mean length of the episodes."""
+
+
+def best_goals(results: Results) -> Goals:
+    """The goals that the best episode of each search reached, leaves ``[S, N, T, ..]``.
+
+    Results keep the steps that reached a goal. The last of them counts as the end of the episode, and as
+    its outcome the task goal: a step that only reaches that is not drawn, since every prompt ends with it.
+
+    Raises:
+      DataError: if the results are of an older version, which did not keep reached goals.
+    """
+    seeds, num, _ = results.returns.shape
+    horizon = results.world.make().spec.horizon
+    goals = np.zeros((seeds, num, horizon, results.task_goals.shape[1]), np.float32)
+    reached = np.zeros((seeds, num, horizon), bool)
+    for seed, task in np.ndindex(seeds, num):
+        best = int(np.argmax(results.returns[seed, task]))
+        steps, which = results.reached_in(seed, task, best)
+        goals[seed, task, steps], reached[seed, task, steps] = which, True
+    last = np.where(reached, np.arange(horizon), 0).max(axis=2)
+    outcomes = np.broadcast_to(results.task_goals[:, None], goals.shape)
+    return Goals(*map(jnp.asarray, (goals, reached, outcomes, (last + 1).astype(np.int32))))
+
+
+def draw_prompts(
+    key: PRNGKeyArray,
+    reached: Goals,
+    final_goals: Float[Array, "N G"],
+    num_slots: int,
+    lengths: Int[Array, "L"],
+    num_draws: int,
+) -> Prompt:
+    """Prompts with leaves ``[L, D, S, N, ..]``: for each length D of them from each trajectory.
+
+    Where a trajectory reached too few goals, a prompt is shorter than asked for.
+
+    Args:
+      key: random key.
+      reached: what each trajectory reached, leaves ``[S, N, T, ..]``.
+      final_goals: the last goal of each prompt.
+      num_slots: P, the number of slots of the prompts.
+      lengths: the numbers of goals.
+      num_draws: D.
+    """
+    shape = (len(lengths), num_draws, *reached.length.shape)
+    keys = jax.random.split(key, shape)
+    draw = partial(draw_longest, num_slots=num_slots)
+    over_tasks = jax.vmap(draw, in_axes=(0, 0, 0, None))
+    over_seeds = jax.vmap(over_tasks, in_axes=(0, 0, None, None))
+    over_draws = jax.vmap(over_seeds, in_axes=(0, None, None, None))
+    over_lengths = jax.vmap(over_draws, in_axes=(0, None, None, 0))
+    return jax.jit(over_lengths)(keys, reached, final_goals, lengths)
+
+
+def by_length(results: Results, seed: int = 0, num_draws: int = DRAWS) -> list[Length]:
+    """How the policy acts under prompts of 1 to K goals, K being the longest that it was trained with.
+
+    Lengths that no trajectory has goals for are left out.
+
+    Raises:
+      UsageError: if the policy of the results is no longer at its place.
+      DataError: if the results are of an older version or other weights, or a return is not finite.
+    """
+    world, env = envs.find(results.env), envs.make(results.env)
+    policy = load_policy_of(results, world, None)
+    slots = policy.config.max_prompt_length
+    lengths = np.arange(1, slots + 1)
+    reached = best_goals(results)
+    key, goals = jax.random.key(seed), jnp.asarray(results.task_goals)
+    prompts = draw_prompts(key, reached, goals, slots, jnp.asarray(lengths), num_draws)
+    shape = prompts.mask.shape[:-1]  # [L, D, S, N]
+    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[3:]), prompts)
+    query = Query(flat, jnp.zeros(flat.mask.shape[:-1], bool))
+    found = uncertainty(env, policy, results.task_set, query, seed=seed)
+    found = jax.tree.map(lambda rows: np.asarray(rows).reshape(shape), found)
+    whole = np.asarray(prompts.mask).sum(axis=-1) == lengths[:, None, None, None]
+    return [
+        _of_length(length, which, jax.tree.map(lambda rows, i=index: rows[i], found))
+        for index, (length, which) in enumerate(zip(lengths.tolist(), whole, strict=True))
+        if which.any()
+    ]
+
+
+def _of_length(num_goals: int, which: np.ndarray, found: Any) -> Length:
+    """The means over those of the prompts ``[D, S, N]`` that have the length."""
+    by_seed = [
+        found.entropy[:, seed][which[:, seed]].mean()
+        for seed in range(which.shape[1])
+        if which[:, seed].any()
+    ]
+    known = bool(np.isfinite(by_seed).all())
+    return Length(
+        num_goals=num_goals,
+        num_prompts=int(which.sum()),
+        entropy=seed_spread(np.array(by_seed)[:, None]) if known else None,
+        return_=float(found.return_[which].mean()),
+        num_steps=float(found.num_steps[which].mean()),
+    )
+
+
+def as_table(world: str, head: str, lengths: list[Length]) -> str:
+    """The table in Markdown; ``head`` is the name of the policy's distribution of actions."""
+    rows = [
+        [
+            str(row.num_goals),
+            str(row.num_prompts),
+            "-" if row.entropy is None else str(row.entropy),
+            number(row.return_),
+            f"{row.num_steps:.1f}",
+        ]
+        for row in lengths
+    ]
+    text = (
+        f"{world}: the policy under prompts drawn from the best trajectory of each search, one episode of "
+        "sampled actions each.\n"
+        "The entropy is that of the distribution of an action in nats, mean over the steps of each "
+        "episode.\n\n"
+        f"{table(HEAD, rows)}\n"
+    )
+    if any(row.entropy is None for row in lengths):
+        text += f"\n- The entropy of the head {head} has no closed form.\n"
+    return text
+
+
+def entropy_table(results: Results) -> str:
+    """How sure the policy of an adaptation is of its actions, by the length of its prompts, in Markdown."""
+    head = load_policy_of(results, envs.find(results.env), None).config.head
+    return as_table(results.env, head, by_length(results))
