@@ -17,10 +17,11 @@ from mgpo_jax.adaptation import search
 from mgpo_jax.distributions import Categorical
 from mgpo_jax.optimizers.base import SearchSpace
 from mgpo_jax.optimizers.methods import prompt_adapter
-from mgpo_jax.planning.maps import Features, plan_map
+from mgpo_jax.planning.maps import plan_map
 from mgpo_jax.planning.orders import NONE, moved_goals, plan_order, without
 from mgpo_jax.planning.proposals import changed, random_prompts
 from mgpo_jax.planning.rehearsal import ARRIVES, FAILS, Ahead, Seen, rehearse
+from mgpo_jax.planning.searching import Features
 from mgpo_jax.planning.steering import deficits, lead_along, steer
 from mgpo_jax.planning.table import (
     FAR,

@@ -8,8 +8,9 @@ from envs.errors import UsageError
 from mgpo_jax.adaptation import Adapter
 from mgpo_jax.methods import PlanHyper, Setting
 from mgpo_jax.optimizers.methods import check_prompts, prompt_adapter, search_space
-from mgpo_jax.planning.maps import Features, plan_map
+from mgpo_jax.planning.maps import plan_map
 from mgpo_jax.planning.orders import plan_order
+from mgpo_jax.planning.searching import Features
 from mgpo_jax.policy import transformer_policy
 
 

@@ -7,6 +7,7 @@ states are not kept, and what leads to them counts as unknown. All functions are
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -48,6 +49,12 @@ def empty_table(spec: EnvSpec, num_states: int) -> Table:
         size=jnp.int32(0),
         stride=jnp.float32(0),
     )
+
+
+def forgotten(table: Table) -> Table:
+    """A table of the same room without any state."""
+    blank = jax.tree.map(jnp.zeros_like, table)
+    return blank._replace(successors=jnp.full_like(table.successors, UNKNOWN))
 
 
 def find_state(table: Table, goal: Float[Array, "G"]) -> Int[Array, ""]:
@@ -124,12 +131,12 @@ def _or_none(table: Table, state: Int[Array, ""]) -> Int[Array, ""]:
     return jnp.where(state == UNKNOWN, len(table.goals), state)
 
 
-def _settled(relax: object, distance: Int[Array, "N"]) -> Int[Array, "N"]:
+def _settled(relax: Callable[[Array], Array], distance: Int[Array, "N"]) -> Int[Array, "N"]:
     """Distances that ``relax`` changes no further."""
     first = (distance, jnp.ones((), bool))
 
     def again(carry: tuple[Array, Array]) -> tuple[Array, Array]:
-        shorter = relax(carry[0])  # type: ignore[operator]
+        shorter = relax(carry[0])
         return shorter, jnp.any(shorter != carry[0])
 
     return jax.lax.while_loop(lambda carry: carry[1], again, first)[0]
@@ -164,6 +171,34 @@ def shortest_way(
         return state, state
 
     return jax.lax.scan(walk, start, jax.random.split(key, longest))[1]
+
+
+class Way(NamedTuple):
+    """A shortest known way from a state to another one."""
+
+    start: Int[Array, ""]
+    end: Int[Array, ""]
+    """``UNKNOWN`` for a state that was not seen."""
+    left: Int[Array, "N"]
+    """``steps_to`` its end."""
+    states: Int[Array, "L"]
+    """The states after ``start``, followed by ``UNKNOWN``."""
+    goals: Goals
+    """The goals that are reached on it, its end included."""
+
+    @property
+    def steps(self) -> Int[Array, ""]:
+        """How many steps it takes; ``FAR`` if no way is known."""
+        return jnp.where(self.end == UNKNOWN, FAR, self.left[self.start])
+
+
+def way_to(
+    key: PRNGKeyArray, table: Table, start: Int[Array, ""], end: Int[Array, ""], longest: int
+) -> Way:
+    """A shortest known way between two states, a random one of several; see ``shortest_way``."""
+    left = steps_to(table, end)
+    states = shortest_way(key, table, start, left, longest)
+    return Way(start, end, left, states, goals_on(table, states))
 
 
 def goals_on(table: Table, way: Int[Array, "L"]) -> Goals:

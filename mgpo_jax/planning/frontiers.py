@@ -1,0 +1,72 @@
+"""Where to explore: frontiers, from where the task goal could be nearer than by any known way."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from mgpo_jax.optimizers.base import SearchSpace
+from mgpo_jax.planning.table import FAR, UNKNOWN, Table, steps_from, way_to
+from mgpo_jax.prompts import Prompt, sample_prompt
+
+# What a frontier costs beside the steps over it: for every time that it was chosen before, for every visit
+# (of at most so many), and by chance.
+COST_OF_CHOICE, COST_OF_VISIT, MOST_VISITS, CHANCE = 2.0, 0.15, 20, 0.7
+
+
+def choose_frontier(
+    key: PRNGKeyArray,
+    table: Table,
+    start: Int[Array, ""],
+    task_goal: Float[Array, "G"],
+    choices: Int[Array, "N"],
+    known: Int[Array, ""],
+) -> Int[Array, ""]:
+    """The state to head for: one with untried actions over which the task goal could be nearest.
+
+    How far the task goal is from a state is bounded from below by its distance in goals, in units of the
+    largest step so far.
+
+    Args:
+      key: random key.
+      table: what is known.
+      start: where episodes start.
+      task_goal: g^M.
+      choices: how often each state was chosen before.
+      known: steps of the shortest known way to the task goal.
+    """
+    steps = steps_from(table, start)
+    away = jnp.sum(jnp.abs(table.goals - task_goal), axis=-1)
+    at_least = jnp.ceil(away / jnp.maximum(table.stride, 1e-6) - 1e-3)
+    over = steps + at_least
+    seen = steps < FAR
+    open_ = seen & jnp.any(table.successors == UNKNOWN, axis=-1)
+    sooner = open_ & (over < known)
+    allowed = jnp.where(jnp.any(sooner), sooner, jnp.where(jnp.any(open_), open_, seen))
+    cost = (
+        over
+        + COST_OF_CHOICE * choices
+        + COST_OF_VISIT * jnp.minimum(table.visits, MOST_VISITS)
+        + CHANCE * jax.random.gumbel(key, over.shape)
+    )
+    return jnp.argmin(jnp.where(allowed, cost, jnp.inf))
+
+
+def prompt_over(
+    key: PRNGKeyArray,
+    space: SearchSpace,
+    table: Table,
+    start: Int[Array, ""],
+    over: Int[Array, ""],
+    task_goal: Float[Array, "G"],
+) -> Prompt:
+    """A random prompt of the shortest way to the state ``over``, that state's goal and the task goal.
+
+    There must be room for two goals.
+    """
+    key_way, key_prompt = jax.random.split(key)
+    way = way_to(key_way, table, start, over, space.horizon)
+    goal = table.goals[over]
+    to = sample_prompt(key_prompt, way.goals, goal, space.num_slots - 1, space.longest - 1)
+    return Prompt(jnp.concatenate([to.goals, task_goal[None]]), jnp.append(to.mask, True))

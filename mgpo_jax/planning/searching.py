@@ -1,0 +1,259 @@
+"""Search for prompts that lead along a known way, by rehearsing them in the table of what was seen."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from mgpo_jax.optimizers.arms import Arms
+from mgpo_jax.optimizers.base import SearchSpace
+from mgpo_jax.planning.proposals import changed, crossed, random_prompts
+from mgpo_jax.planning.rehearsal import (
+    ARRIVES,
+    FAILS,
+    LEAVES,
+    Ahead,
+    Rehearsal,
+    Seen,
+    any_of,
+    rehearse,
+)
+from mgpo_jax.planning.steering import deficits, lead_along, steer
+from mgpo_jax.planning.table import FAR, Table, Way
+from mgpo_jax.planning.trials import is_tried
+from mgpo_jax.policy import Policy
+from mgpo_jax.prompts import Prompt, single_goal
+from mgpo_jax.trees import choose
+
+NUM_PROMPTS = 32
+"""Prompts that are rehearsed together: in each round of changes."""
+NUM_KEPT = 20
+"""Of these, those that the next search begins with, beside new random ones."""
+NUM_PARENTS = 12
+"""The best ones, which are changed."""
+CROSSED = 0.25
+"""Share of changed prompts that have the goals of two parents."""
+SLACK = 12
+"""A rehearsal is given up when it will take that many steps more than twice the shortest known way."""
+OF_EACH_END = (6, 10, 10)
+"""How many prompts that arrive, leave what is known, or fail are kept at least, if there are so many."""
+NUM_LED = 8
+"""Prompts that are steered together."""
+LONGEST_LED = 64
+"""Steps of the longest way that prompts are steered along."""
+
+
+class Features(NamedTuple):
+    """What the plan makes use of; without one of them it is an ablation."""
+
+    rounds: int = 3
+    """Rounds of changed prompts that a search rehearses at most; 0 is no rehearsal at all."""
+    steering: int = 20
+    """Gradient steps that a search steers prompts by; 0 is none."""
+    splice: bool = True
+    """Whether ways are made of all episodes, or of the best one alone."""
+    frontier: bool = True
+    """Whether exploring also heads for frontiers."""
+
+
+class Tools(NamedTuple):
+    """What the plan is made with. Everything in it is static, but for the policy's weights."""
+
+    space: SearchSpace
+    world: Seen
+    policy: Policy
+    features: Features
+
+
+class Memory(NamedTuple):
+    """What a search leaves for the next one."""
+
+    kept: Prompt
+    """Its best prompts [NUM_KEPT]."""
+    led: Prompt
+    """The prompts that it steered [NUM_LED]."""
+    exists: Bool[Array, ""]
+    """Whether there was a search."""
+
+
+def no_memory(task_goal: Float[Array, "G"], num_slots: int) -> Memory:
+    """The memory before the first search."""
+    first = single_goal(task_goal, num_slots)
+    kept, led = (
+        jax.tree.map(lambda leaf, num=num: jnp.stack([leaf] * num), first)
+        for num in (NUM_KEPT, NUM_LED)
+    )
+    return Memory(kept, led, jnp.zeros((), bool))
+
+
+class Offer(NamedTuple):
+    """The best prompt of one kind that a search has found."""
+
+    prompt: Prompt
+    steps: Int[Array, ""]
+    exists: Bool[Array, ""]
+
+
+class Found(NamedTuple):
+    """What a search for prompts has found."""
+
+    memory: Memory
+    sure: Offer
+    """Arrives sooner than any greedy episode before."""
+    hopeful: Offer
+    """Leaves what is known, and may arrive sooner."""
+    num_rehearsed: Int[Array, ""]
+
+
+class Pool(NamedTuple):
+    """A search in progress: prompts [NUM_PROMPTS] with their rehearsals, the best first."""
+
+    prompts: Prompt
+    rehearsal: Rehearsal
+
+
+def nothing_found(memory: Memory) -> Found:
+    """What is found without a search."""
+    prompt = jax.tree.map(lambda rows: rows[0], memory.kept)
+    nothing = Offer(prompt, jnp.int32(FAR), jnp.zeros((), bool))
+    return Found(memory, nothing, nothing, jnp.int32(0))
+
+
+def search_prompts(
+    key: PRNGKeyArray,
+    tools: Tools,
+    table: Table,
+    way: Way,
+    memory: Memory,
+    prompts: Arms,
+    verified: Int[Array, ""],
+) -> Found:
+    """Search for prompts by rehearsing them: the kept ones and random ones, then changed and steered ones.
+
+    Args:
+      key: random key.
+      tools: what the plan is made with.
+      table: what is known.
+      way: a shortest known way to the task goal, which is known.
+      memory: what earlier searches have left.
+      prompts: those that were acted with.
+      verified: steps of the shortest greedy episode that arrived.
+    """
+    known, task_goal = way.steps, table.goals[way.end]
+    limit = jnp.minimum(verified - 1, 2 * known + SLACK)
+    ahead = Ahead(table, way.start, way.end, way.left, limit)
+    key_random, key_rounds, key_led = jax.random.split(key, 3)
+    tried = partial(rehearse, tools.world, tools.policy, ahead)
+
+    space = tools.space
+    fresh = random_prompts(
+        key_random, way.goals, task_goal, space.num_slots, space.longest, NUM_PROMPTS
+    )
+    keeps = memory.exists & (jnp.arange(NUM_PROMPTS) < NUM_KEPT)
+    first = jax.tree.map(
+        lambda old, new: jnp.where(
+            jnp.expand_dims(keeps, tuple(range(1, new.ndim))),
+            jnp.concatenate([old, new[NUM_KEPT:]]),
+            new,
+        ),
+        memory.kept,
+        fresh,
+    )
+    pool = _best(Pool(first, tried(first)))
+
+    def child(key: PRNGKeyArray, pool: Pool) -> Prompt:
+        key_parent, key_cross, key_crosses, key_where, key_change = jax.random.split(key, 5)
+        first, second = jax.random.randint(key_parent, (2,), 0, NUM_PARENTS)
+        parent, mate = (
+            jax.tree.map(lambda rows, i=i: rows[i], pool.prompts) for i in (first, second)
+        )
+        mixed = crossed(key_cross, parent, mate, way.goals, space.longest)
+        parent = choose(jax.random.bernoulli(key_crosses, CROSSED), mixed, parent)
+        strays, farthest = pool.rehearsal.strays[first], pool.rehearsal.farthest[first]
+        around = jnp.where(jax.random.bernoulli(key_where), strays, farthest)
+        key_once, key_again, key_more = jax.random.split(key_change, 3)
+        once = changed(key_once, parent, way.goals, space.longest, table.stride, around)
+        twice = changed(key_again, once, way.goals, space.longest, table.stride, around)
+        return choose(jax.random.bernoulli(key_more), twice, once)
+
+    def lacks_shortest(carry: tuple[Array, Pool]) -> Bool[Array, ""]:
+        index, pool = carry
+        shortest = (pool.rehearsal.ends[0] == ARRIVES) & (pool.rehearsal.steps[0] <= known)
+        return (index < tools.features.rounds) & ~shortest
+
+    def change(carry: tuple[Array, Pool]) -> tuple[Array, Pool]:
+        index, pool = carry
+        keys = jax.random.split(jax.random.fold_in(key_rounds, index), NUM_PROMPTS)
+        children = jax.vmap(lambda key: child(key, pool))(keys)
+        return index + 1, _best(_joined(pool, Pool(children, tried(children))))
+
+    num_rounds, pool = jax.lax.while_loop(lacks_shortest, change, (jnp.int32(0), pool))
+    num = NUM_PROMPTS * (1 + num_rounds)
+    led = memory.led
+    lead = lead_along(table, way.start, way.states, min(space.horizon, LONGEST_LED))
+
+    def steered(pool: Pool) -> tuple[Pool, Prompt, Array]:
+        keys = jax.random.split(key_led, NUM_LED)
+        own = jax.vmap(
+            lambda key, parent: changed(
+                key, parent, way.goals, space.longest, table.stride, pool.rehearsal.strays[0]
+            )
+        )(keys, led)
+        first = _joined(led, own, _rows(pool.prompts, NUM_LED), _rows(fresh, NUM_LED))
+        chosen = jnp.argsort(deficits(tools.policy, lead, first))[:NUM_LED]
+        first = jax.tree.map(lambda rows: rows[chosen], first)
+        moved, _ = steer(tools.policy, lead, first, table.stride, tools.features.steering)
+        return _best(_joined(pool, Pool(moved, tried(moved)))), moved, jnp.int32(NUM_LED)
+
+    if tools.features.steering and tools.policy.score is not None:
+        needed = lacks_shortest((jnp.int32(-1), pool)) & lead.complete
+        pool, led, more = jax.lax.cond(
+            needed, steered, lambda pool: (pool, led, jnp.int32(0)), pool
+        )
+        num += more
+    sooner = pool.rehearsal.steps < verified
+    if space.deterministic:  # what a prompt did once it would do again
+        sooner &= ~jax.vmap(partial(is_tried, prompts))(pool.prompts)
+    return Found(
+        memory=Memory(_rows(pool.prompts, NUM_KEPT), led, jnp.ones((), bool)),
+        sure=_offer(pool, sooner & (pool.rehearsal.ends == ARRIVES)),
+        hopeful=_offer(pool, sooner & (pool.rehearsal.ends == LEAVES)),
+        num_rehearsed=num,
+    )
+
+
+def _joined(*trees: Any) -> Any:
+    """The rows of several pytrees one after another."""
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *trees)
+
+
+def _rows(tree: Any, num: int) -> Any:
+    """The first rows of a pytree."""
+    return jax.tree.map(lambda rows: rows[:num], tree)
+
+
+def _offer(pool: Pool, which: Bool[Array, "C"]) -> Offer:
+    index, exists = any_of(which, pool.rehearsal.rank)
+    prompt = jax.tree.map(lambda rows: rows[index], pool.prompts)
+    return Offer(prompt, pool.rehearsal.steps[index], exists)
+
+
+def _best(pool: Pool) -> Pool:
+    """The ``NUM_PROMPTS`` best of a pool, each once, with some of each end, the best first."""
+    rehearsal = pool.rehearsal
+    num = len(rehearsal.rank)
+    # Prompts of the same rank do the same, as far as it matters.
+    again = jnp.any(jnp.tril(rehearsal.rank[:, None] == rehearsal.rank, -1), axis=-1)
+    order = jnp.argsort(jnp.where(again, jnp.iinfo(jnp.int32).max, rehearsal.rank))
+    pool = jax.tree.map(lambda rows: rows[order], pool)
+    ends, again = pool.rehearsal.ends, again[order]
+    is_end = ends[:, None] == jnp.array([ARRIVES, LEAVES, FAILS])
+    place = jnp.cumsum(is_end, axis=0)[jnp.arange(num), ends]  # among those of its end
+    spare = again | (place > jnp.array(OF_EACH_END)[ends])
+    # The order among those that stay is kept, since the sort is stable.
+    chosen = jnp.sort(jnp.argsort(spare)[:NUM_PROMPTS])
+    return jax.tree.map(lambda rows: rows[chosen], pool)
