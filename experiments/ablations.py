@@ -36,6 +36,7 @@ from experiments.store.summary import read_summary
 from experiments.store.tables import number, table
 from experiments.store.work import open_journal
 from experiments.training import train
+from mgpo_jax import methods
 from mgpo_jax.claims import claimed
 from mgpo_jax.distributions import HEADS
 from mgpo_jax.methods import UCB, UcbHyper
@@ -64,10 +65,12 @@ class Part(NamedTuple):
     """In the paper's table."""
     training: PretrainConfig | None
     """That of its policy; None for the released one."""
-    hyper: UcbHyper
+    hyper: Any
+    """Hyper-parameters of its method."""
     results: Path
     together: str
     """Parts that have this in common are adapted in one program."""
+    method: str = "ucb"
 
 
 def planned(
@@ -103,14 +106,18 @@ def trained(settings: PretrainConfig) -> Path:
 
 
 def adapted(
-    config: ReproduceConfig, policy_folder: Path | None, folders: Mapping[Path, UcbHyper]
+    config: ReproduceConfig,
+    policy_folder: Path | None,
+    folders: Mapping[Path, Any],
+    method: str = "ucb",
 ) -> None:
-    """UCB with each variant of its settings, as one program; finished results stay as they are.
+    """A method with each variant of its settings, as one program; finished results stay as they are.
 
     Args:
       config: settings of the command.
       policy_folder: folder of the policy; None for the released one.
       folders: result folders to write, with the hyper-parameters of each.
+      method: who adapts.
     """
     world, env = envs.find(config.world), envs.make(config.world)
     policy = load_policy(world, policy_folder)
@@ -118,6 +125,7 @@ def adapted(
     configs = [
         AdaptConfig(
             env=config.world,
+            method=method,
             policy=policy_folder,
             seeds=config.seeds,
             episodes=EPISODES,
@@ -234,11 +242,42 @@ def heads(config: ReproduceConfig) -> list[Part]:
     return compared(config, names, lambda head: planned(config, head, head=head))
 
 
+def plan(config: ReproduceConfig) -> list[Part]:
+    """The own optimizer without one of the things that it makes use of, beside UCB (not in the paper).
+
+    Raises:
+      NotAvailableError: for a world whose goals are no states, where it makes use of none of them.
+    """
+    spec = envs.make(config.world).spec
+    if not (spec.goals_are_states and spec.discrete):
+        raise NotAvailableError(
+            f"there is no plan for {config.world}: it leaves out parts of the plan in worlds of discrete "
+            "actions whose goals are states; name another world with --env"
+        )
+    world = envs.find(config.world)
+    variants: dict[str, dict[str, Any]] = {
+        "plan": {},
+        "without steering": {"steer": 0},
+        "without rehearsal": {"rehearse": 0},
+        "without splicing": {"splice": False},
+        "without frontiers": {"frontier": False},
+    }
+    parts = []
+    for label in chosen(config, [*variants, "ucb"]):
+        method = "ucb" if label == "ucb" else "plan"
+        hyper = methods.find(method).hyper_in(world, variants.get(label))
+        name = label.replace(" ", "-")
+        results = config.folder / "plan" / f"{name}-{config.seeds}seeds"
+        parts.append(Part(label, name, None, hyper, results, label, method))
+    return parts
+
+
 PLANS: dict[str, Callable[[ReproduceConfig], list[Part]]] = {
     "table4": table4,
     "table5": table5,
     "figure8": figure8,
     "heads": heads,
+    "plan": plan,
 }
 
 
@@ -253,7 +292,8 @@ def make(config: ReproduceConfig) -> list[Line]:
         parts = list(group)
         training = parts[0].training
         policy = None if training is None else trained(training)
-        adapted(config, policy, {part.results: part.hyper for part in parts})
+        folders = {part.results: part.hyper for part in parts}
+        adapted(config, policy, folders, parts[0].method)
         home = envs.find(config.world).home
         lines += [
             Line(part.label, part.results, paper_value(config.what, home, part.name))

@@ -41,6 +41,8 @@ def main(config: AdaptConfig) -> None:
     """Adapt to each task within a budget of episodes, and judge what was found."""
     if config.validation and config.tasks is not None:
         raise UsageError("--validation draws the tasks; leave out --tasks")
+    if config.validation_seed and not config.validation:
+        raise UsageError("--validation-seed says which validation tasks to draw; add --validation")
     folder = config.folder
     if not (config.resume and os.path.isdir(folder)):
         refuse_existing(folder, "remove it", "choose another with --out")
@@ -51,7 +53,7 @@ def main(config: AdaptConfig) -> None:
 
     env = envs.make(config.env)
     policy = load_policy(world, config.policy, methods.find(config.method).policy)
-    tasks = chosen_tasks(world, env, config.tasks, config.validation)
+    tasks = chosen_tasks(world, env, config.tasks, config.validation, config.validation_seed)
     if folder.is_dir():
         results = finished(folder, config, policy, tasks)
         print(f"{folder} is finished already", file=sys.stderr)

@@ -31,10 +31,13 @@ from mgpo_jax.schema import Json, read_document
 from mgpo_jax.tasks import evaluation_tasks, load_tasks, task_arrays, test_tasks
 
 
-def chosen_tasks(world: World, env: Environment, path: Path | None, validation: bool) -> Task:
+def chosen_tasks(
+    world: World, env: Environment, path: Path | None, validation: bool, validation_seed: int = 0
+) -> Task:
     """A user's tasks, the world's test tasks, or as many others."""
     if validation:
-        return evaluation_tasks(env, world.num_test_tasks, world.num_test_tasks)
+        num = world.num_test_tasks
+        return evaluation_tasks(env, num, num, seed=validation_seed)
     return load_tasks(path, env) if path is not None else test_tasks(world)
 
 

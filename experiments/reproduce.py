@@ -3,9 +3,10 @@
 Tables 1, 2 and 8 compare methods in several worlds: cells that are missing are adapted, each by itself,
 and what cannot be had is a dash with the reason. Table 3 evaluates the same adaptations behind noise. An
 ablation is of one world, or of several one by one: it trains what is missing (a stopped run goes on where
-it was), adapts with UCB, prints the table and draws the learning curves. All trainings of an ablation have
-the same budget, shorter than that of the released policies and named above the table. ``all`` makes
-everything that is missing, and ``list`` says what that is.
+it was), adapts with UCB, prints the table and draws the learning curves; ``plan`` trains nothing and adapts
+with the own optimizer, less one of its parts. All trainings of an ablation have the same budget, shorter
+than that of the released policies and named above the table. ``all`` makes everything that is missing, and
+``list`` says what that is.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from experiments.store.settings import (
     GLANCE,
     LIST,
     PICTURES,
+    TRAIN_NOTHING,
     ReproduceConfig,
     check_reproduction,
 )
@@ -123,10 +125,11 @@ def make_ablation(config: ReproduceConfig) -> None:
     check_replaceable(files_of(config))
     lines = make_lines(config)
     budget = ""
-    if config.what != "table4":  # which trains nothing
+    if config.what not in TRAIN_NOTHING:
         steps, trajectories = config.num_steps, config.num_trajectories
         budget = f", {steps:,} gradient steps on {trajectories:,} trajectories each"
-    text = f"{config.world}, UCB, {config.seeds} seeds{budget}\n\n{as_table(lines)}\n"
+    who = "" if config.what == "plan" else ", UCB"
+    text = f"{config.world}{who}, {config.seeds} seeds{budget}\n\n{as_table(lines)}\n"
     say(text)
     save(config, text, lines)
     print(f"table and curves in {files_of(config)[0]} and .png", file=sys.stderr)

@@ -288,7 +288,7 @@ PLAN = Method(
     title="plan",
     summary="keeps all that it saw as a model of the task, plans in it, and rehearses prompts for the plan",
     make="mgpo_jax.planning.methods:make_plan",
-    check="mgpo_jax.planning.methods:check_plan",
+    check=f"{_HERE}:check_prompts",
     hyper=PlanHyper,
 )
 EXPLORE = Method(

@@ -60,7 +60,11 @@ def test_tasks(world: World | str) -> Task:
 
 
 def evaluation_tasks(
-    env: Environment, num: int, num_test_tasks: int, tested: Environment | None = None
+    env: Environment,
+    num: int,
+    num_test_tasks: int,
+    tested: Environment | None = None,
+    seed: int = 0,
 ) -> Task:
     """Tasks to watch a training or to choose settings by: none of them is a test task.
 
@@ -69,9 +73,16 @@ def evaluation_tasks(
       num: how many there are.
       num_test_tasks: how many tasks are kept for test.
       tested: the world whose test tasks these are, where tasks of ``env`` have its fingerprints [``env``].
+      seed: which of several sets. That of 0 watches trainings; others share no task with it.
+
+    Raises:
+      DataError: if the world has too few tasks.
     """
-    drawn = sample_tasks(env, EVAL_SEED, 2 * num)
+    drawn = sample_tasks(env, EVAL_SEED + seed, 2 * num)
     forbidden = task_hashes(env, benchmark_tasks(tested or env, num_test_tasks))
+    if seed:
+        watched = sample_tasks(env, EVAL_SEED, 2 * num)
+        forbidden = np.concatenate([forbidden, task_hashes(env, watched)])
     allowed = ~np.isin(task_hashes(env, drawn), forbidden)
     chosen = np.flatnonzero(allowed)[:num]
     if len(chosen) < num:

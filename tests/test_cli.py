@@ -108,6 +108,7 @@ RESULT = Path(__file__).parents[1] / "results/maze15/ucb"
         ("adapt --bandit bbt --std-init 0", 2, "--std-init must be above 0"),
         ("adapt --bandit ucb --scale nan", 2, "--scale must be a finite number"),
         ("adapt --validation --tasks mine.npz", 2, "--validation draws the tasks"),
+        ("adapt --validation-seed 1", 2, "add --validation"),
         ("adapt --policy nowhere", 2, "no policy in nowhere"),
         ("adapt --bandit gcbc --max-goals 3", 2, "no setting of gcbc; it is one of ucb, bpe"),
         ("adapt --method grips --no-keep-rewarded", 2, "--keep-rewarded is no setting of grips"),

@@ -63,8 +63,8 @@ def policy():
 
 
 def test_the_built_in_methods():
-    assert methods.names()[:6] == ["ucb", "bpe", "explore", "grips", "bbt", "gcbc"]
-    for name in methods.names()[:6]:
+    assert methods.names()[:7] == ["ucb", "bpe", "plan", "explore", "grips", "bbt", "gcbc"]
+    for name in methods.names()[:7]:
         method = methods.find(name)
         assert method.name == name
         assert method.title
@@ -245,7 +245,7 @@ def test_bounds_of_hyper_parameters(method, hyper, says):
 
 
 def test_what_is_within_bounds_may_be_used():
-    for name in methods.names()[:6]:
+    for name in methods.names()[:7]:
         method = methods.find(name)
         method.check_use(SETTING, method.hyper())
     UCB.check_use(SETTING, UcbHyper(c=0.0, scale=None, max_goals=3))

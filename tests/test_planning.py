@@ -34,6 +34,7 @@ from mgpo_jax.planning.table import (
     steps_from,
     steps_to,
 )
+from mgpo_jax.planning.worths import SHARE_OF_PROMPT, alike, likeness, plan_worth, posterior
 from mgpo_jax.policy import Policy
 from mgpo_jax.prompts import goals_of, prompt_of, single_goal
 from mgpo_jax.rollout import Query, rollout
@@ -438,3 +439,57 @@ def test_moved_goals_keep_the_task_goal():
     assert float(moved.goals[-1, 0]) == 9.0
     assert (moved.goals[:2] == 0).all()
     assert 0 < float(jnp.abs(moved.goals - prompt.goals).max()) < 2
+
+
+def test_likeness_counts_goals_and_orders():
+    one, two, three = jnp.eye(3)
+    goal = jnp.ones(3)
+
+    def made(*goals):
+        return prompt_of(jnp.stack([*goals, goal]), 5)
+
+    shared, in_order = alike(made(one, two), made(one, two))
+    np.testing.assert_allclose(
+        [shared, in_order], [3, 3], atol=0.2
+    )  # the pairs with the task goal too
+    shared, in_order = alike(made(one, two), made(two, one))
+    np.testing.assert_allclose([shared, in_order], [3, 2], atol=0.2)
+    assert likeness(made(one, two), made(one, two)) == pytest.approx(1, abs=1e-6)
+    order = likeness(made(one, two), made(two, one))
+    assert likeness(made(one), made(three)) < order < 1
+
+
+def test_a_posterior_is_that_of_a_gaussian_process():
+    keys = jax.random.split(jax.random.key(0), 6)
+    space = SearchSpace(
+        num_slots=4,
+        horizon=5,
+        return_range=(0.0, 1.0),
+        num_episodes=8,
+        sample_goal=lambda key: jnp.zeros(2),
+        deterministic=False,
+    )
+    optimizer = plan_worth(space)
+    state = optimizer.init(keys[0], jnp.ones(2))
+    returns = [0.1, 0.9, 0.4, 0.7, 0.2]
+    prompts = []
+    for key, return_ in zip(keys[1:], returns, strict=True):
+        prompt = prompt_of([*np.asarray(jax.random.uniform(key, (2, 2))), [1.0, 1.0]], 4)
+        prompts.append(prompt)
+        steps = Trajectory(
+            jnp.zeros((5, 1)), jnp.zeros(5, jnp.int32), jnp.zeros((5, 2)),
+            jnp.zeros(5, bool), jnp.zeros((5, 2)), jnp.int32(1),
+        )  # fmt: skip
+        episode = Episode(steps, jnp.zeros(5), jnp.float32(return_), jnp.zeros(1), jnp.zeros(2))
+        state = optimizer.tell(state, Query(prompt, jnp.zeros((), bool)), episode)
+    gram = np.array([[float(likeness(a, b)) for b in prompts] for a in prompts])
+    spread = np.std(returns)
+    between = (SHARE_OF_PROMPT * spread) ** 2
+    inverse = np.linalg.inv(between * gram + spread**2 * np.eye(5))
+    wanted = np.mean(returns) + between * gram @ inverse @ (returns - np.mean(returns))
+    variance = between - np.diag(between * gram @ inverse @ gram * between)
+    found = posterior(state, state.kernel)
+    np.testing.assert_allclose(found.mean[:5], wanted, rtol=1e-4)
+    np.testing.assert_allclose(found.std[:5] ** 2, variance, rtol=1e-3)
+    best = optimizer.best(state)
+    np.testing.assert_array_equal(best.goals, prompts[int(np.argmax(wanted))].goals)

@@ -286,6 +286,7 @@ def test_all_goes_on_after_a_failure(
     one_by_one = {what for what, env in made if env == ("maze15",)}
     assert one_by_one == {
         "figure2", "figure3", "figure5", "figure9", "figure10", "table4", "table5", "figure8", "heads",
+        "plan",
     }  # fmt: skip
     said = capsys.readouterr().err
     assert "table2 gridworld maze15 failed: no room" in said

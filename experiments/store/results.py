@@ -334,6 +334,7 @@ class Config(BaseModel):
     policy: Place | None = None
     tasks: Place | None = None
     validation: bool = False
+    validation_seed: Seed = 0
     seeds: NumSeeds | None = None
     episodes: NumEpisodes | None = None
     seed: Seed = 0

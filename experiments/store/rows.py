@@ -40,7 +40,13 @@ from mgpo_jax.released import released_folder
 from mgpo_jax.schema import ArrayField, array_names, read_arrays, read_document
 
 PAPER_EPISODES = 100  # the paper's budget for one task
-SHOWN = ("policy", "seed", "eval_every", "eval_episodes")  # settings that every method has
+SHOWN = (
+    "policy",
+    "seed",
+    "validation_seed",
+    "eval_every",
+    "eval_episodes",
+)  # settings that every method has
 STATED = {"seed", "eval_every"}  # may differ beside the paper's number, since the row states it
 
 

@@ -430,6 +430,8 @@ class AdaptConfig(Common):
     tasks of the world)."""
     validation: bool = False
     """Adapt to as many tasks that are no test tasks, to choose a method's settings by."""
+    validation_seed: Seed = 0
+    """Which validation tasks: those of 0 watch trainings, too; those of other seeds are none of them."""
     seeds: NumSeeds = 3
     """Independent adaptations to each task [3]."""
     episodes: NumEpisodes = 100
@@ -465,7 +467,8 @@ class ReproduceConfig(Common):
     """table1, table2, table8 (methods in all worlds), figure6, figure7 (the same with their curves), table3
     (optimized prompts behind noise), figure2, figure3, figure5, figure9, figure10 (prompts and what is done
     under them), figure11 (the worlds at a glance), table4 (prompt length and c of UCB), table5 (datasets),
-    figure8 (longer prompts), heads (distributions of continuous actions), list (what is there of each, and
+    figure8 (longer prompts), heads (distributions of continuous actions), plan (the own optimizer without
+    some of its parts), list (what is there of each, and
     what the rest costs), or all (everything that is missing)."""
     env: tuple[Name, ...] = ()
     """The worlds, by name or as module:attribute (default: those of the paper's table or figure; of an
@@ -512,8 +515,10 @@ COMPARISONS = ("table1", "table2", "table3", "table8", "figure6", "figure7")
 """What ``experiments.reproduce`` makes of several methods in several worlds."""
 PICTURES = ("figure2", "figure3", "figure5", "figure9", "figure10")
 """What it draws of adaptations."""
-ABLATIONS = ("table4", "table5", "figure8", "heads")
-"""What it trains for."""
+ABLATIONS = ("table4", "table5", "figure8", "heads", "plan")
+"""What it varies one thing for."""
+TRAIN_NOTHING = ("table4", "plan")
+"""Those of them that adapt the released policy."""
 GLANCE = "figure11"
 """The picture of all worlds."""
 LIST, ALL = "list", "all"
@@ -528,8 +533,8 @@ def check_reproduction(config: ReproduceConfig) -> None:
         return
     if config.scale != "cpu":
         raise UsageError(f"{config.what} has no use for --scale {config.scale}; leave it out")
-    if config.what == "table4":  # which trains nothing
-        _refuse(config, ("only", "steps", "trajectories"))
+    if config.what in TRAIN_NOTHING:
+        _refuse(config, (*(("only",) if config.what == "table4" else ()), "steps", "trajectories"))
     elif config.num_trajectories <= (kept := pretrain_preset(config.world, "fast").holdout):
         raise UsageError(
             f"--trajectories must be above {kept}, the trajectories kept out of training, found "

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from envs.errors import UsageError
 from mgpo_jax.adaptation import Adapter
 from mgpo_jax.methods import PlanHyper, Setting
-from mgpo_jax.optimizers.methods import check_prompts, prompt_adapter, search_space
+from mgpo_jax.optimizers.methods import prompt_adapter, search_space
 from mgpo_jax.planning.maps import plan_map
 from mgpo_jax.planning.orders import plan_order
 from mgpo_jax.planning.searching import Features
+from mgpo_jax.planning.worths import plan_worth
 from mgpo_jax.policy import transformer_policy
 
 
@@ -21,18 +21,8 @@ def make_plan(setting: Setting, params: Any, hyper: PlanHyper) -> Adapter:
     spec = setting.env.spec
     if spec.goals_are_states and spec.discrete:
         optimizer = plan_map(space, spec, policy, hyper.num_states, features)
-    else:
+    elif spec.reward_confirms_goals:
         optimizer = plan_order(space)
+    else:
+        optimizer = plan_worth(space)
     return prompt_adapter(policy, optimizer, setting.judged)
-
-
-def check_plan(setting: Setting, hyper: PlanHyper) -> None:
-    """Raise ``UsageError`` in a world of which no model can be made."""
-    check_prompts(setting, hyper)
-    spec = setting.env.spec
-    if not (spec.goals_are_states and spec.discrete) and not spec.reward_confirms_goals:
-        raise UsageError(
-            f"plan needs a world whose goals are states (with discrete actions) or whose rewards confirm "
-            f"goals, and {spec.name} says neither of itself (EnvSpec.goals_are_states, "
-            "reward_confirms_goals); use ucb or bpe"
-        )

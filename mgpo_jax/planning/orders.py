@@ -9,6 +9,7 @@ it: the whole order, without one of its goals, or with goals that are moved a li
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -25,6 +26,8 @@ from mgpo_jax.trees import choose
 
 MAX_GOALS = 64
 """Room for different goals; further ones are not kept."""
+NUM_ARMS = 64
+"""Room for the prompts that were acted with greedily."""
 NONE = -1
 SAME = 1e-4  # goals that differ by less are the same
 ENOUGH = 1e-4  # a return this near to the largest one is the largest
@@ -228,11 +231,9 @@ class OrderState(NamedTuple):
     num_asked: Int[Array, ""]
 
 
-# Long because the four functions of an optimizer share its settings and are read together.
 def plan_order(space: SearchSpace) -> PromptOptimizer:
     """The plan in a world whose rewards confirm goals."""
-    num_slots, largest = space.num_slots, space.return_range[1]
-    longest = space.longest
+    num_slots = space.num_slots
 
     def init(key: PRNGKeyArray, task_goal: Float[Array, "G"]) -> OrderState:
         del key
@@ -243,7 +244,7 @@ def plan_order(space: SearchSpace) -> PromptOptimizer:
             first=jnp.int32(NONE),
             planned=single_goal(task_goal, num_slots),
             planned_first=jnp.int32(NONE),
-            prompts=empty_arms(min(64, space.num_episodes), num_slots, goal_dim),
+            prompts=empty_arms(min(NUM_ARMS, space.num_episodes), num_slots, goal_dim),
             variant=jnp.int32(NONE),
             pulls=jnp.zeros(num_slots),
             earned=jnp.zeros(num_slots),
@@ -251,86 +252,103 @@ def plan_order(space: SearchSpace) -> PromptOptimizer:
             num_asked=jnp.int32(0),
         )
 
-    def whole(state: OrderState) -> Prompt:
-        """The prompt of the complete order."""
-        sequence = state.order.prefix[: num_slots - 1]
-        return _right_aligned(state.order, sequence, state.order.length, state.task_goal, longest)
-
-    def variant_of(state: OrderState, index: Int[Array, ""]) -> Prompt:
-        prompt = whole(state)
-        return choose(index == 0, prompt, without(prompt, jnp.maximum(index - 1, 0)))
-
-    def possible(state: OrderState) -> Bool[Array, "V"]:
-        """Which variants there are: the whole order, and one without each of its goals."""
-        return jnp.append(True, whole(state).mask[:-1])
-
-    def estimates(state: OrderState) -> Float[Array, "V"]:
-        prior = jnp.full(num_slots, PRIOR_WITHOUT).at[0].set(PRIOR_WHOLE)
-        mean = (state.earned + PRIOR_WEIGHT * prior) / (state.pulls + PRIOR_WEIGHT)
-        return jnp.where(possible(state), mean, -jnp.inf)
-
-    def next_variant(key: PRNGKeyArray, state: OrderState) -> tuple[Prompt, Array]:
-        """The variant of the complete order to act with, and its number."""
-        if not space.deterministic:
-            spread = SPREAD / jnp.sqrt(state.pulls + PRIOR_WEIGHT)
-            drawn = estimates(state) + spread * jax.random.normal(key, spread.shape)
-            index = jnp.argmax(drawn)
-            return variant_of(state, index), index
-        # The greedy episode of each variant is the same every time, so each is tried once.
-        left = jnp.sort(jnp.where(possible(state), jnp.arange(num_slots), num_slots))
-        index = left[jnp.minimum(state.num_variants, num_slots - 1)]
-        is_moved = (index == num_slots) | (state.num_variants >= num_slots)
-        moved = moved_goals(key, whole(state))
-        prompt = choose(is_moved, moved, variant_of(state, jnp.minimum(index, num_slots - 1)))
-        solved = jnp.max(state.prompts.entry_return) > largest - ENOUGH
-        return choose(solved, best_tried(state), prompt), jnp.int32(NONE)
-
-    def best_tried(state: OrderState) -> Prompt:
-        index = jnp.argmax(estimated_returns(state.prompts, space.deterministic))
-        return state.prompts.prompt(index)
-
-    def ask(key: PRNGKeyArray, state: OrderState) -> tuple[Query, OrderState]:
-        prompt, variant = next_variant(key, state)
-        complete = state.order.complete
-        prompt = choose(complete, prompt, state.planned)
-        again = is_tried(state.prompts, prompt) & space.deterministic
-        greedy = complete | ~again  # once more, it would show nothing new
-        return Query(prompt, greedy), state._replace(
-            first=jnp.where(complete, NONE, state.planned_first),
-            variant=jnp.where(complete, variant, NONE),
-            num_variants=state.num_variants + complete,
-            num_asked=state.num_asked + 1,
-        )
-
-    def tell(state: OrderState, query: Query, episode: Episode) -> OrderState:
-        order = observe(state.order, episode, largest)
-        # What it was tried after is the prefix before this episode.
-        same = order.length == state.order.length
-        row = jnp.where(same & (state.first != NONE), state.first, MAX_GOALS)
-        order = order._replace(tried=order.tried.at[row].add(1.0, mode="drop"))
-        variant = jnp.where(state.variant == NONE, len(state.pulls), state.variant)
-        key = jax.random.fold_in(jax.random.key(0), state.num_asked)
-        key = jax.random.fold_in(key, jnp.sum(episode.trajectory.length))
-        key_first, key_rest = jax.random.split(key)
-        first = next_goal(key_first, order)
-        return state._replace(
-            order=order,
-            planned=plan_prompt(key_rest, order, first, state.task_goal, num_slots, longest),
-            planned_first=first,
-            prompts=with_result(state.prompts, query, episode.return_),
-            pulls=state.pulls.at[variant].add(1.0, mode="drop"),
-            earned=state.earned.at[variant].add(episode.return_, mode="drop"),
-        )
-
     def best(state: OrderState) -> Prompt:
-        tried = choose(state.prompts.size == 0, state.planned, best_tried(state))
         if space.deterministic:
-            return tried
-        return choose(
-            state.order.complete, variant_of(state, jnp.argmax(estimates(state))), state.planned
-        )
+            return choose(state.prompts.size == 0, state.planned, _best_tried(state))
+        index = jnp.argmax(_estimates(state, space.longest))
+        return choose(state.order.complete, _variant_of(state, index, space.longest), state.planned)
 
-    return PromptOptimizer(init, ask, tell, best)
+    return PromptOptimizer(init, partial(_ask, space), partial(_tell, space), best)
+
+
+def _ask(space: SearchSpace, key: PRNGKeyArray, state: OrderState) -> tuple[Query, OrderState]:
+    """What is planned, or a variant of the complete order."""
+    prompt, variant = _next_variant(key, space, state)
+    complete = state.order.complete
+    prompt = choose(complete, prompt, state.planned)
+    again = is_tried(state.prompts, prompt) & space.deterministic
+    greedy = complete | ~again  # once more, it would show nothing new
+    return Query(prompt, greedy), state._replace(
+        first=jnp.where(complete, NONE, state.planned_first),
+        variant=jnp.where(complete, variant, NONE),
+        num_variants=state.num_variants + complete,
+        num_asked=state.num_asked + 1,
+    )
+
+
+def _tell(space: SearchSpace, state: OrderState, query: Query, episode: Episode) -> OrderState:
+    """What is known after an episode, and the plan for the next one."""
+    order = observe(state.order, episode, space.return_range[1])
+    # What it was tried after is the prefix before this episode.
+    same = order.length == state.order.length
+    row = jnp.where(same & (state.first != NONE), state.first, MAX_GOALS)
+    order = order._replace(tried=order.tried.at[row].add(1.0, mode="drop"))
+    variant = jnp.where(state.variant == NONE, len(state.pulls), state.variant)
+    key = jax.random.fold_in(jax.random.key(0), state.num_asked)
+    key = jax.random.fold_in(key, jnp.sum(episode.trajectory.length))
+    key_first, key_rest = jax.random.split(key)
+    first = next_goal(key_first, order)
+    planned = plan_prompt(key_rest, order, first, state.task_goal, space.num_slots, space.longest)
+    return state._replace(
+        order=order,
+        planned=planned,
+        planned_first=first,
+        prompts=with_result(state.prompts, query, episode.return_),
+        pulls=state.pulls.at[variant].add(1.0, mode="drop"),
+        earned=state.earned.at[variant].add(episode.return_, mode="drop"),
+    )
+
+
+def _whole(state: OrderState, max_goals: int | Int[Array, ""]) -> Prompt:
+    """The prompt of the complete order."""
+    order = state.order
+    sequence = order.prefix[: len(state.pulls) - 1]
+    return _right_aligned(order, sequence, order.length, state.task_goal, max_goals)
+
+
+def _variant_of(
+    state: OrderState, index: Int[Array, ""], max_goals: int | Int[Array, ""]
+) -> Prompt:
+    """A variant of the complete order by its number."""
+    prompt = _whole(state, max_goals)
+    return choose(index == 0, prompt, without(prompt, jnp.maximum(index - 1, 0)))
+
+
+def _possible(state: OrderState, max_goals: int | Int[Array, ""]) -> Bool[Array, "V"]:
+    """Which variants there are: the whole order, and one without each of its goals."""
+    return jnp.append(True, _whole(state, max_goals).mask[:-1])
+
+
+def _estimates(state: OrderState, max_goals: int | Int[Array, ""]) -> Float[Array, "V"]:
+    """What each variant is expected to return; -inf for those that there are not."""
+    prior = jnp.full(len(state.pulls), PRIOR_WITHOUT).at[0].set(PRIOR_WHOLE)
+    mean = (state.earned + PRIOR_WEIGHT * prior) / (state.pulls + PRIOR_WEIGHT)
+    return jnp.where(_possible(state, max_goals), mean, -jnp.inf)
+
+
+def _next_variant(
+    key: PRNGKeyArray, space: SearchSpace, state: OrderState
+) -> tuple[Prompt, Int[Array, ""]]:
+    """The variant of the complete order to act with, and its number; ``NONE`` for moved goals."""
+    longest, num_slots = space.longest, space.num_slots
+    if not space.deterministic:
+        spread = SPREAD / jnp.sqrt(state.pulls + PRIOR_WEIGHT)
+        drawn = _estimates(state, longest) + spread * jax.random.normal(key, spread.shape)
+        index = jnp.argmax(drawn)
+        return _variant_of(state, index, longest), index
+    # The greedy episode of each variant is the same every time, so each is tried once.
+    left = jnp.sort(jnp.where(_possible(state, longest), jnp.arange(num_slots), num_slots))
+    index = left[jnp.minimum(state.num_variants, num_slots - 1)]
+    is_moved = (index == num_slots) | (state.num_variants >= num_slots)
+    moved = moved_goals(key, _whole(state, longest))
+    variant = _variant_of(state, jnp.minimum(index, num_slots - 1), longest)
+    solved = jnp.max(state.prompts.entry_return) > space.return_range[1] - ENOUGH
+    return choose(solved, _best_tried(state), choose(is_moved, moved, variant)), jnp.int32(NONE)
+
+
+def _best_tried(state: OrderState) -> Prompt:
+    """The prompt of the best greedy episode, where each prompt's is always the same."""
+    return state.prompts.prompt(jnp.argmax(estimated_returns(state.prompts, deterministic=True)))
 
 
 def moved_goals(key: PRNGKeyArray, prompt: Prompt) -> Prompt:

@@ -22,7 +22,7 @@ from mgpo_jax.planning.rehearsal import (
     any_of,
     rehearse,
 )
-from mgpo_jax.planning.steering import deficits, lead_along, steer
+from mgpo_jax.planning.steering import Lead, deficits, lead_along, steer
 from mgpo_jax.planning.table import FAR, Table, Way
 from mgpo_jax.planning.trials import is_tried
 from mgpo_jax.policy import Policy
@@ -123,6 +123,32 @@ def nothing_found(memory: Memory) -> Found:
     return Found(memory, nothing, nothing, jnp.int32(0))
 
 
+class Quest(NamedTuple):
+    """What a search is for and what it knows."""
+
+    tools: Tools
+    table: Table
+    way: Way
+    """A shortest known way to the task goal, which is known."""
+    limit: Int[Array, ""]
+    """Steps of the longest way that is of any use."""
+
+    @property
+    def task_goal(self) -> Float[Array, "G"]:
+        return self.table.goals[self.way.end]
+
+    def tried(self, prompts: Prompt) -> Pool:
+        """Prompts with their rehearsals."""
+        way = self.way
+        ahead = Ahead(self.table, way.start, way.end, way.left, self.limit)
+        return Pool(prompts, rehearse(self.tools.world, self.tools.policy, ahead, prompts))
+
+    def changed(self, key: PRNGKeyArray, prompt: Prompt, around: Int[Array, ""]) -> Prompt:
+        """A prompt with one change, see ``proposals.changed``."""
+        longest, stride = self.tools.space.longest, self.table.stride
+        return changed(key, prompt, self.way.goals, longest, stride, around)
+
+
 def search_prompts(
     key: PRNGKeyArray,
     tools: Tools,
@@ -143,78 +169,35 @@ def search_prompts(
       prompts: those that were acted with.
       verified: steps of the shortest greedy episode that arrived.
     """
-    known, task_goal = way.steps, table.goals[way.end]
-    limit = jnp.minimum(verified - 1, 2 * known + SLACK)
-    ahead = Ahead(table, way.start, way.end, way.left, limit)
+    quest = Quest(tools, table, way, jnp.minimum(verified - 1, 2 * way.steps + SLACK))
     key_random, key_rounds, key_led = jax.random.split(key, 3)
-    tried = partial(rehearse, tools.world, tools.policy, ahead)
-
     space = tools.space
     fresh = random_prompts(
-        key_random, way.goals, task_goal, space.num_slots, space.longest, NUM_PROMPTS
+        key_random, way.goals, quest.task_goal, space.num_slots, space.longest, NUM_PROMPTS
     )
-    keeps = memory.exists & (jnp.arange(NUM_PROMPTS) < NUM_KEPT)
-    first = jax.tree.map(
-        lambda old, new: jnp.where(
-            jnp.expand_dims(keeps, tuple(range(1, new.ndim))),
-            jnp.concatenate([old, new[NUM_KEPT:]]),
-            new,
-        ),
-        memory.kept,
-        fresh,
-    )
-    pool = _best(Pool(first, tried(first)))
+    pool = _best(quest.tried(_begun(memory, fresh)))
 
-    def child(key: PRNGKeyArray, pool: Pool) -> Prompt:
-        key_parent, key_cross, key_crosses, key_where, key_change = jax.random.split(key, 5)
-        first, second = jax.random.randint(key_parent, (2,), 0, NUM_PARENTS)
-        parent, mate = (
-            jax.tree.map(lambda rows, i=i: rows[i], pool.prompts) for i in (first, second)
-        )
-        mixed = crossed(key_cross, parent, mate, way.goals, space.longest)
-        parent = choose(jax.random.bernoulli(key_crosses, CROSSED), mixed, parent)
-        strays, farthest = pool.rehearsal.strays[first], pool.rehearsal.farthest[first]
-        around = jnp.where(jax.random.bernoulli(key_where), strays, farthest)
-        key_once, key_again, key_more = jax.random.split(key_change, 3)
-        once = changed(key_once, parent, way.goals, space.longest, table.stride, around)
-        twice = changed(key_again, once, way.goals, space.longest, table.stride, around)
-        return choose(jax.random.bernoulli(key_more), twice, once)
-
-    def lacks_shortest(carry: tuple[Array, Pool]) -> Bool[Array, ""]:
-        index, pool = carry
-        shortest = (pool.rehearsal.ends[0] == ARRIVES) & (pool.rehearsal.steps[0] <= known)
-        return (index < tools.features.rounds) & ~shortest
+    def goes_on(carry: tuple[Array, Pool]) -> Bool[Array, ""]:
+        return (carry[0] < tools.features.rounds) & ~_has_shortest(carry[1], way.steps)
 
     def change(carry: tuple[Array, Pool]) -> tuple[Array, Pool]:
         index, pool = carry
         keys = jax.random.split(jax.random.fold_in(key_rounds, index), NUM_PROMPTS)
-        children = jax.vmap(lambda key: child(key, pool))(keys)
-        return index + 1, _best(_joined(pool, Pool(children, tried(children))))
+        children = jax.vmap(lambda key: _child(key, quest, pool))(keys)
+        return index + 1, _best(_joined(pool, quest.tried(children)))
 
-    num_rounds, pool = jax.lax.while_loop(lacks_shortest, change, (jnp.int32(0), pool))
-    num = NUM_PROMPTS * (1 + num_rounds)
-    led = memory.led
-    lead = lead_along(table, way.start, way.states, min(space.horizon, LONGEST_LED))
-
-    def steered(pool: Pool) -> tuple[Pool, Prompt, Array]:
-        keys = jax.random.split(key_led, NUM_LED)
-        own = jax.vmap(
-            lambda key, parent: changed(
-                key, parent, way.goals, space.longest, table.stride, pool.rehearsal.strays[0]
-            )
-        )(keys, led)
-        first = _joined(led, own, _rows(pool.prompts, NUM_LED), _rows(fresh, NUM_LED))
-        chosen = jnp.argsort(deficits(tools.policy, lead, first))[:NUM_LED]
-        first = jax.tree.map(lambda rows: rows[chosen], first)
-        moved, _ = steer(tools.policy, lead, first, table.stride, tools.features.steering)
-        return _best(_joined(pool, Pool(moved, tried(moved)))), moved, jnp.int32(NUM_LED)
-
+    num_rounds, pool = jax.lax.while_loop(goes_on, change, (jnp.int32(0), pool))
+    num, led = NUM_PROMPTS * (1 + num_rounds), memory.led
     if tools.features.steering and tools.policy.score is not None:
-        needed = lacks_shortest((jnp.int32(-1), pool)) & lead.complete
-        pool, led, more = jax.lax.cond(
-            needed, steered, lambda pool: (pool, led, jnp.int32(0)), pool
+        lead = lead_along(table, way.start, way.states, min(space.horizon, LONGEST_LED))
+        needed = ~_has_shortest(pool, way.steps) & lead.complete
+        pool, led = jax.lax.cond(
+            needed,
+            lambda pool: _steered(key_led, quest, lead, pool, led, fresh),
+            lambda pool: (pool, led),
+            pool,
         )
-        num += more
+        num += NUM_LED * needed
     sooner = pool.rehearsal.steps < verified
     if space.deterministic:  # what a prompt did once it would do again
         sooner &= ~jax.vmap(partial(is_tried, prompts))(pool.prompts)
@@ -224,6 +207,55 @@ def search_prompts(
         hopeful=_offer(pool, sooner & (pool.rehearsal.ends == LEAVES)),
         num_rehearsed=num,
     )
+
+
+def _begun(memory: Memory, fresh: Prompt) -> Prompt:
+    """What a search begins with: the kept prompts and random ones, or random ones alone."""
+    keeps = memory.exists & (jnp.arange(NUM_PROMPTS) < NUM_KEPT)
+    return jax.tree.map(
+        lambda old, new: jnp.where(
+            jnp.expand_dims(keeps, tuple(range(1, new.ndim))),
+            jnp.concatenate([old, new[NUM_KEPT:]]),
+            new,
+        ),
+        memory.kept,
+        fresh,
+    )
+
+
+def _has_shortest(pool: Pool, known: Int[Array, ""]) -> Bool[Array, ""]:
+    """Whether the best prompt surely takes a shortest known way."""
+    return (pool.rehearsal.ends[0] == ARRIVES) & (pool.rehearsal.steps[0] <= known)
+
+
+def _child(key: PRNGKeyArray, quest: Quest, pool: Pool) -> Prompt:
+    """A changed prompt of one of the best, at times with goals of another one."""
+    key_parent, key_cross, key_crosses, key_where, key_change = jax.random.split(key, 5)
+    first, second = jax.random.randint(key_parent, (2,), 0, NUM_PARENTS)
+    parent, mate = (jax.tree.map(lambda rows, i=i: rows[i], pool.prompts) for i in (first, second))
+    longest = quest.tools.space.longest
+    mixed = crossed(key_cross, parent, mate, quest.way.goals, longest)
+    parent = choose(jax.random.bernoulli(key_crosses, CROSSED), mixed, parent)
+    strays, farthest = pool.rehearsal.strays[first], pool.rehearsal.farthest[first]
+    around = jnp.where(jax.random.bernoulli(key_where), strays, farthest)
+    key_once, key_again, key_more = jax.random.split(key_change, 3)
+    once = quest.changed(key_once, parent, around)
+    twice = quest.changed(key_again, once, around)
+    return choose(jax.random.bernoulli(key_more), twice, once)
+
+
+def _steered(
+    key: PRNGKeyArray, quest: Quest, lead: Lead, pool: Pool, led: Prompt, fresh: Prompt
+) -> tuple[Pool, Prompt]:
+    """The pool with steered prompts, and these: of those led before, changed ones, good and random ones."""
+    tools, stride = quest.tools, quest.table.stride
+    change = lambda key, prompt: quest.changed(key, prompt, pool.rehearsal.strays[0])  # noqa: E731
+    own = jax.vmap(change)(jax.random.split(key, NUM_LED), led)
+    first = _joined(led, own, _rows(pool.prompts, NUM_LED), _rows(fresh, NUM_LED))
+    chosen = jnp.argsort(deficits(tools.policy, lead, first))[:NUM_LED]
+    first = jax.tree.map(lambda rows: rows[chosen], first)
+    moved, _ = steer(tools.policy, lead, first, stride, tools.features.steering)
+    return _best(_joined(pool, quest.tried(moved))), moved
 
 
 def _joined(*trees: Any) -> Any:
