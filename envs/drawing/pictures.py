@@ -52,6 +52,10 @@ class Pictures(NamedTuple):
     visits: Callable | None = None
     """``(axes, tasks, shown) -> ScalarMappable | None``: where many episodes went under each prompt, in
     colors that all axes share. What is returned becomes the color bar."""
+    known: Callable | None = None
+    """``(axes, tasks, shown, reached) -> ScalarMappable | None``: one episode under each prompt, on top of
+    what was seen until then. ``reached[i]`` are the goals ``[n, G]`` that all episodes before have reached.
+    What is returned becomes the color bar."""
     episodes: Callable | None = None
     """``(axes, tasks, shown) -> None``: one episode on each task as a still picture."""
     video: Callable | None = None

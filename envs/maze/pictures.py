@@ -16,6 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, PowerNorm, to_rgb
 from matplotlib.patches import Circle, Rectangle
+from matplotlib.patheffects import Normal, Stroke
 
 from envs.base import Episode, Task
 from envs.drawing.marks import draw_box, draw_disc, draw_leader, spread_apart
@@ -52,6 +53,7 @@ def maze_pictures(env: MazeRunner) -> Pictures:
     return Pictures(
         prompts=partial(draw_prompts, start),
         visits=partial(draw_visits, start),
+        known=partial(draw_known, start),
         video=partial(write_video, start),
         panel=(1.9, 2.1),
     )
@@ -82,6 +84,33 @@ def draw_visits(
     for ax, task, each, counts in zip(axes, tasks, shown, visits, strict=True):
         draw_maze(
             ax, task.maze, start, task.goal, each.goals, visits=counts, norm=norm, lanes=lanes
+        )
+    return visit_scale(norm)
+
+
+def draw_known(
+    start: Cell,
+    axes: Sequence[Axes],
+    tasks: Sequence[Task],
+    shown: Sequence[Shown],
+    reached: Sequence[np.ndarray],
+) -> ScalarMappable:
+    """Each prompt on its maze, the way of its episode, and how often each cell was visited until then."""
+    counts = [reached_counts(goals, task.maze) for goals, task in zip(reached, tasks, strict=True)]
+    norm = visit_norm(*counts)
+    lanes = max(bar_lanes(len(tasks[0].maze), [each.goals]) for each in shown)
+    for ax, task, each, visits in zip(axes, tasks, shown, counts, strict=True):
+        walk = walk_of(each.episode, len(task.maze), start)
+        draw_maze(
+            ax,
+            task.maze,
+            start,
+            task.goal,
+            each.goals,
+            visits=visits,
+            paths=[walk],
+            norm=norm,
+            lanes=lanes,
         )
     return visit_scale(norm)
 
@@ -138,6 +167,13 @@ def visit_counts(episodes: Episode, maze: np.ndarray, start: Cell) -> np.ndarray
     np.add.at(counts, tuple(cells[happened].T), 1.0)
     counts[tuple(start)] += len(cells)
     return counts / len(cells)
+
+
+def reached_counts(goals: np.ndarray, maze: np.ndarray) -> np.ndarray:
+    """How often each cell is among goals ``[n, 2]`` that were reached."""
+    counts = np.zeros(maze.shape)
+    np.add.at(counts, tuple(np.rint(np.asarray(goals) * len(maze)).astype(int).T), 1.0)
+    return counts
 
 
 def place_goals(goals: np.ndarray, side: int) -> Placement:
@@ -205,7 +241,10 @@ def draw_maze(
     ax.imshow(_cell_colors(maze, visits, norm), interpolation="nearest", zorder=0)
     for path in paths or ():
         rows, columns = np.asarray(path, float).reshape(-1, 2).T
-        ax.plot(columns, rows, color=AGENT_COLOR, alpha=0.5, linewidth=1.4, zorder=1)
+        seen_on_dark = [Stroke(linewidth=2.6, foreground="white"), Normal()]
+        ax.plot(
+            columns, rows, color=AGENT_COLOR, linewidth=1.4, zorder=1, path_effects=seen_on_dark
+        )
     _draw_markers(ax, side, _markers(side, start, goal, prompts), lanes)
 
     right = picture_width(side, lanes) - 0.5

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 NUM_ROLLOUTS = 64
 NUM_DRAWS = 64  # of which the longest prompt is taken
 STAGES = (1, 10, 20, 40, 100)  # episodes after which a search is drawn
+EARLY_STAGES = (1, 2, 4, 8, 16)  # episodes after which what was seen is drawn
 BAR_ROOM = 0.6  # inches of a color bar
 LEGEND_WIDTH = 5.0  # inches that a figure with a legend below it takes at least
 LABEL_ROOM = (0.9, 0.65)  # inches of the labels of rows, and of title and legend of a search
@@ -87,7 +88,8 @@ def figures_of_results(
     for number, (name, result) in enumerate(_file_names(results).items()):
         if pictures.search:
             yield f"{name}_search.png", later(search, pictures, result, which, seed)
-        if not (pictures.visits or pictures.episodes or pictures.video or pictures.frame):
+        drawn = (pictures.visits, pictures.known, pictures.episodes, pictures.video, pictures.frame)
+        if not any(drawn):
             continue
         play = play_with(result)
         if pictures.visits:
@@ -99,6 +101,10 @@ def figures_of_results(
             for task in which:
                 draw = later(evolution, pictures, result, play, task, seed, key)
                 yield f"{name}_evolution_task{task}.png", draw
+        if pictures.known and result.reached is not None:
+            for task in which:
+                draw = later(known, pictures, result, play, task, seed, key)
+                yield f"{name}_known_task{task}.png", draw
         if pictures.episodes:
             draw = later(episodes, pictures, result, play, which, seed, key)
             yield f"{name}_episodes.png", draw
@@ -183,6 +189,31 @@ def evolution(
             shown.append(Shown(_title(_count(stage, "episode"), played), goals, played))
     figure, axes = _panels(pictures, 1, len(shown), BAR_ROOM)
     _draw_visits(pictures, figure, axes, [result.task(task)] * len(shown), shown)
+    return figure
+
+
+@styled
+def known(
+    pictures: Pictures,
+    result: Results,
+    play: Play,
+    task: int,
+    seed: int,
+    key: jax.Array,
+    stages: Sequence[int] = EARLY_STAGES,
+) -> Figure:
+    """What a search has seen after some episodes, the best prompt then, and a greedy episode under it."""
+    shown, reached = [], []
+    for stage in stages:
+        if stage <= result.returns.shape[2]:
+            goals = _best_goals(result, seed, task, stage)
+            played = _play_once(play, key, result.task(task), goals)
+            shown.append(Shown(_title(_count(stage, "episode"), played), goals, played))
+            seen = [result.reached_in(seed, task, episode)[1] for episode in range(stage)]
+            reached.append(np.concatenate(seen))
+    figure, axes = _panels(pictures, 1, len(shown), BAR_ROOM)
+    scale = pictures.known(axes, [result.task(task)] * len(shown), shown, reached)
+    _finish(figure, axes, shown, scale, "visits so far")
     return figure
 
 
@@ -348,13 +379,17 @@ def _draw_visits(
     shown: Sequence[Shown],
 ) -> None:
     """Where episodes went, below their titles and beside the scale of their colors."""
-    scale = pictures.visits(axes, tasks, shown)
+    _finish(figure, axes, shown, pictures.visits(axes, tasks, shown), "visits in an episode")
+
+
+def _finish(
+    figure: Figure, axes: Sequence[Axes], shown: Sequence[Shown], scale: Any, label: str
+) -> None:
+    """Titles above pictures, and the scale of their colors beside them."""
     for ax, each in zip(axes, shown, strict=True):
         ax.set_title(each.title)
     if scale is not None:
-        bar = figure.colorbar(
-            scale, ax=axes, label="visits in an episode", fraction=0.03, pad=0.01, aspect=25
-        )
+        bar = figure.colorbar(scale, ax=axes, label=label, fraction=0.03, pad=0.01, aspect=25)
         bar.outline.set_visible(False)
 
 
