@@ -221,7 +221,6 @@ def test_steering_moves_a_prompt_onto_a_way(tasks):
     left = steps_to(table, find_state(table, WORLD.task_goal(task)))
     way = shortest_way(jax.random.key(0), table, start, left, 40)
     lead = lead_along(table, start, way, 32)
-    assert lead.complete
     assert int(lead.real.sum()) == int(left[start]) == int(episode.trajectory.length)
     assert deficits(POLICY, lead, jax.tree.map(lambda leaf: leaf[None], around))[0] == 0
     beside = prompt_of(np.array([[7.4, 1.9], [1.2, 1.3], [1, 4]]) / SIDE, NUM_SLOTS)
@@ -232,7 +231,11 @@ def test_steering_moves_a_prompt_onto_a_way(tasks):
     np.testing.assert_array_equal(steered.goals[0, -1], beside.goals[-1])
     np.testing.assert_array_equal(steered.goals[0, :2], 0)
     np.testing.assert_allclose(deficits(POLICY, lead, steered), after, atol=1e-5)
-    assert not lead_along(table, start, way, 4).complete
+    cut = lead_along(table, start, way, 4)
+    np.testing.assert_array_equal(cut.actions, lead.actions[:4])
+    room = lead_along(table, start, way, 64)  # more than the way has
+    np.testing.assert_array_equal(room.real[:32], lead.real)
+    assert not room.real[32:].any()
 
 
 def test_changed_prompts_are_prompts_of_the_way():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -22,7 +23,7 @@ from mgpo_jax.planning.rehearsal import (
     any_of,
     rehearse,
 )
-from mgpo_jax.planning.steering import Lead, deficits, lead_along, steer
+from mgpo_jax.planning.steering import deficits, lead_along, steer
 from mgpo_jax.planning.table import FAR, Table, Way
 from mgpo_jax.planning.trials import is_tried
 from mgpo_jax.policy import Policy
@@ -43,8 +44,8 @@ OF_EACH_END = (6, 10, 10)
 """How many prompts that arrive, leave what is known, or fail are kept at least, if there are so many."""
 NUM_LED = 8
 """Prompts that are steered together."""
-LONGEST_LED = 64
-"""Steps of the longest way that prompts are steered along."""
+LENGTHS_LED = (32, 64)
+"""Room for steps of the ways that prompts are steered along; a longer one is not. Less room costs less."""
 
 
 class Features(NamedTuple):
@@ -189,14 +190,14 @@ def search_prompts(
     num_rounds, pool = jax.lax.while_loop(goes_on, change, (jnp.int32(0), pool))
     num, led = NUM_PROMPTS * (1 + num_rounds), memory.led
     if tools.features.steering and tools.policy.score is not None:
-        lead = lead_along(table, way.start, way.states, min(space.horizon, LONGEST_LED))
-        needed = ~_has_shortest(pool, way.steps) & lead.complete
-        pool, led = jax.lax.cond(
-            needed,
-            lambda pool: _steered(key_led, quest, lead, pool, led, fresh),
+        room = jnp.array(LENGTHS_LED)
+        needed = ~_has_shortest(pool, way.steps) & (way.steps <= room[-1])
+        branches: list[Callable[[Pool], tuple[Pool, Prompt]]] = [
             lambda pool: (pool, led),
-            pool,
-        )
+            *(partial(_steered, key_led, quest, fresh, led, longest) for longest in LENGTHS_LED),
+        ]
+        which = jnp.where(needed, 1 + jnp.sum(way.steps > room), 0)
+        pool, led = jax.lax.switch(which, branches, pool)
         num += NUM_LED * needed
     sooner = pool.rehearsal.steps < verified
     if space.deterministic:  # what a prompt did once it would do again
@@ -245,9 +246,14 @@ def _child(key: PRNGKeyArray, quest: Quest, pool: Pool) -> Prompt:
 
 
 def _steered(
-    key: PRNGKeyArray, quest: Quest, lead: Lead, pool: Pool, led: Prompt, fresh: Prompt
+    key: PRNGKeyArray, quest: Quest, fresh: Prompt, led: Prompt, longest: int, pool: Pool
 ) -> tuple[Pool, Prompt]:
-    """The pool with steered prompts, and these: of those led before, changed ones, good and random ones."""
+    """The pool with steered prompts, and these: of those led before, changed ones, good and random ones.
+
+    There is room for ways of ``longest`` steps.
+    """
+    way = quest.way
+    lead = lead_along(quest.table, way.start, way.states, longest)
     tools, stride = quest.tools, quest.table.stride
     change = lambda key, prompt: quest.changed(key, prompt, pool.rehearsal.strays[0])  # noqa: E731
     own = jax.vmap(change)(jax.random.split(key, NUM_LED), led)

@@ -32,17 +32,15 @@ class Lead(NamedTuple):
     actions: Int[Array, "L"]
     real: Bool[Array, "L"]
     """Which steps there are."""
-    complete: Bool[Array, ""]
-    """Whether the way has no more steps than these."""
 
 
 def lead_along(table: Table, start: Int[Array, ""], way: Int[Array, "T"], longest: int) -> Lead:
     """A way, given by the states after ``start``, as the policy sees it; cut off after so many steps."""
-    states = jnp.concatenate([start[None], way])
+    missing = jnp.full(max(longest - len(way), 0), UNKNOWN)
+    states = jnp.concatenate([start[None], way, missing])
     before, after = states[:longest], states[1 : longest + 1]
     actions = jnp.argmax(table.successors[before] == after[:, None], axis=-1)
-    complete = jnp.all(way[longest:] == UNKNOWN)
-    return Lead(table.obs[before], actions, after != UNKNOWN, complete)
+    return Lead(table.obs[before], actions, after != UNKNOWN)
 
 
 def deficit_and_loss(
