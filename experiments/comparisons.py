@@ -68,6 +68,7 @@ TABLES: Mapping[str, Comparison] = {
     "table2": Comparison(
         title="Table 2: prompt optimization methods",
         methods=("grips", "bbt", "explore", "ucb", "bpe"),
+        further=("plan",),
     ),
     "table3": Comparison(
         title="Table 3: optimized prompts behind noise",

@@ -313,7 +313,7 @@ def test_the_inventory_counts_prices_and_doubts(tmp_path: Path) -> None:
         for line in inventory.inventory(config).splitlines()[2:]
         for row in [[cell.strip() for cell in line.strip("|").split("|")]]
     }
-    assert rows["table2"][:2] == ["maze15", "5 of 5"]  # all published
+    assert rows["table2"][:2] == ["maze15", "6 of 6"]  # all published
     assert rows["table2"][3] == ""
     assert rows["table1"][1] == "3 of 11"
     # GC-BC acts for next to nothing; of SPiRL and PTGM nothing is published that tells a price.

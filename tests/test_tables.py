@@ -101,7 +101,8 @@ def cells(row: Row) -> dict[str, str]:
 )
 def test_published_results_have_rows(folder: Path) -> None:
     row = read_row(folder)
-    assert row.tasks == "test"
+    public = folder.parent.name == "radt"  # the mazes of others
+    assert row.tasks == ("own" if public else "test")
     found = cells(row)
     assert found["folder"] == str(folder)
     one_seed = row.summary["num_seeds"] == 1
@@ -112,7 +113,7 @@ def test_published_results_have_rows(folder: Path) -> None:
     released = "policy" not in row.settings
     assert released == ("ablations" not in folder.parts)
     paper = paper_final(found["env"], found["method"])
-    assert found["paper: final"] == ("" if as_printed or not released else paper)
+    assert found["paper: final"] == ("" if as_printed or public or not released else paper)
 
 
 def test_the_published_table_is_that_of_the_results(
@@ -124,7 +125,7 @@ def test_the_published_table_is_that_of_the_results(
         "crafter-symbolic", "crafter-map", "crafter",
     )  # fmt: skip
     methods = (
-        "ucb", "bpe", "explore", "grips", "bbt", "ucb-seed1", "ucb-seed2",
+        "plan", "ucb", "bpe", "explore", "grips", "bbt", "ucb-seed1", "ucb-seed2",
         "reinforce", "reinforce-careful", "ppo", "ppo-careful",
         "ptgm", "ptgm-goal", "ptgm-random", "ptgm-prior", "ptgm-oracle", "spirl", "spirl-prior",
     )  # fmt: skip
