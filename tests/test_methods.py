@@ -172,7 +172,7 @@ def test_built_in_names_are_taken(registry, name):
         (UCB, "num_edits", "--num-edits is no setting of ucb; it is one of grips$"),
         (BPE, "c", "--c is no setting of bpe; it is one of ucb$"),
         (BBT, "keep_rewarded", "no setting of bbt; it is one of ucb, bpe, explore$"),
-        (methods.GCBC, "max_goals", "of gcbc; it is one of ucb, bpe, explore, grips, bbt$"),
+        (methods.GCBC, "max_goals", "of gcbc; it is one of ucb, bpe, plan, explore, grips, bbt$"),
         (GRIPS, "temper", "--temper is no setting of grips$"),
     ],
 )
