@@ -15,6 +15,7 @@ COMMANDS = {
     "evaluate": "evaluate optimized prompts once more, under noise or in another world",
     "check": "compare a world with its official program, under optimized prompts",
     "table": "compare adaptations in one table",
+    "compare": "compare adaptations to the same tasks pair by pair, with intervals",
     "plot": "draw figures of adaptations",
     "report": "show adaptations in one HTML page, down to every episode",
     "playground": "make an HTML page in which anyone leads a policy by goals",

@@ -52,6 +52,7 @@ BASE: dict[str, tuple[str, tuple[str, ...]]] = {
     "evaluate": ("result --obs-noise 0.1 --json new.json", ("result", "policy")),
     "check": ("result --out new.json", ("result", "policy")),
     "table": ("result", ("result",)),
+    "compare": ("result result --csv new.csv", ("result",)),
     "plot": ("result --out new", ("result", "policy")),
     "report": ("result --out new.html", ("result",)),
     "playground": ("--policy policy --out new.html", ("policy",)),
@@ -62,7 +63,7 @@ BASE: dict[str, tuple[str, tuple[str, ...]]] = {
 """A sound command line for each command, and the sound material in the current folder that it needs."""
 
 MAY_WRITE = (
-    "new", "new.json", "new.html", "report.html", "playground.html", "runs", "data", "figures",
+    "new", "new.json", "new.html", "new.csv", "report.html", "playground.html", "runs", "data", "figures",
 )  # fmt: skip
 """Where commands may write that are not refused."""
 
@@ -111,6 +112,7 @@ CONTRADICTIONS: dict[str, tuple[tuple[str, str], ...]] = {
     ),
     "check": (("--env gridworld", "gridworld"), ("nowhere", "nowhere"), ("policy", "policy")),
     "table": (("nowhere", "nowhere"), ("result nowhere", "nowhere"), ("policy", "policy")),
+    "compare": (("nowhere", "nowhere"), ("policy", "policy"), ("--csv nowhere/new.csv", "nowhere")),
     "plot": (
         ("--seed 1", "--seed"),
         ("--tasks 2", "--tasks"),

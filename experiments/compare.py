@@ -1,0 +1,55 @@
+"""Compare adaptations to the same tasks pair by pair: ``python -m experiments.compare RUN_DIR RUN_DIR``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NoReturn
+
+import tyro
+
+from envs.errors import UsageError
+from experiments.runtime import Common, refuse_existing_file, run, say
+
+
+@dataclass(frozen=True)
+class CompareConfig(Common):
+    """Settings of ``experiments.compare``."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Result folders of two adaptations or more; each is compared with the first."""
+    csv: Path | None = None
+    """File to write the return of each task and run to, as comma-separated values."""
+
+
+def main(config: CompareConfig) -> None:
+    """Say task by task how adaptations differ from the first of them, with 95 % intervals."""
+    if len(config.runs) < 2:
+        raise UsageError(
+            f"comparing needs two result folders or more, found {len(config.runs)}; usage: "
+            "python -m experiments.compare RUN_DIR RUN_DIR ..."
+        )
+    if config.csv is not None:
+        refuse_existing_file(config.csv, "--csv")
+    from experiments.pairing import as_csv, as_table, differing
+    from experiments.store.results import load_results
+
+    results = [load_results(folder, parts=()) for folder in config.runs]
+    text = as_table(config.runs, results)
+    for warning in differing(config.runs, results):
+        print(f"warning: {warning}", file=sys.stderr)
+    say(text)
+    if config.csv is not None:
+        from mgpo_jax.files import write_text
+
+        write_text(config.csv, as_csv(config.runs, results))
+
+
+def command(argv: Sequence[str] | None = None) -> NoReturn:
+    run(CompareConfig, main, argv=argv)
+
+
+if __name__ == "__main__":
+    command()

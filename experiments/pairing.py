@@ -1,0 +1,88 @@
+"""Adaptations to the same tasks against each other, task by task."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from experiments.store.results import Results
+from experiments.store.statistics import SeedSpread, compare
+from experiments.store.tables import table
+
+SAME = 1e-6  # returns of a task that differ by less are equal
+HEAD = (
+    "run", "method", "final (mean ± std over seeds)", "minus the first [95 %]",
+    "better than the first with probability [95 %]", "tasks better / equal / worse",
+)  # fmt: skip
+FACTS = {
+    "num_episodes": "budgets of episodes",
+    "num_seeds": "numbers of seeds",
+    "policy_sha256": "weights",
+    "env": "worlds",
+}
+"""What should be the same in all runs, by its name in ``summary.json``."""
+
+
+def as_table(runs: Sequence[Path], results: Sequence[Results]) -> str:
+    """One row for each run, in Markdown: its final return, and how it differs from that of the first run.
+
+    Differences are paired by task, and seeds are drawn anew within each task. With one seed there is no
+    interval. Returns of a task are means over seeds.
+
+    Raises:
+      UsageError: for runs on different tasks.
+    """
+    first, rows = results[0], []
+    for folder, result in zip(runs, results, strict=True):
+        summary = result.summary
+        final = SeedSpread(summary["final_return"], summary["final_return_std_over_seeds"])
+        row = [str(folder), result.method, str(final)]
+        if result is not first:
+            difference, improvement = compare(result, first)
+            row += [str(difference), str(improvement), _counts(result, first)]
+        rows.append(row + [""] * (len(HEAD) - len(row)))
+    return table(HEAD, rows)
+
+
+def _counts(result: Results, first: Results) -> str:
+    """How many tasks are better, equal and worse."""
+    change = final_returns(result) - final_returns(first)
+    counts = np.sum(change > SAME), np.sum(np.abs(change) <= SAME), np.sum(change < -SAME)
+    return " / ".join(map(str, counts))
+
+
+def final_returns(result: Results) -> np.ndarray:
+    """The final return of each task, mean over seeds, [N]."""
+    means: np.ndarray = result.eval_returns[:, :, -1].mean(axis=0, dtype=np.float64)
+    return means
+
+
+def differing(runs: Sequence[Path], results: Sequence[Results]) -> Iterator[str]:
+    """What makes the comparison of some runs unequal, one sentence for each."""
+    for name, what in FACTS.items():
+        found = [result.summary.get(name) for result in results]
+        if len(set(found)) > 1:
+            told = ", ".join(
+                f"{folder} {_short(value)}" for folder, value in zip(runs, found, strict=True)
+            )
+            yield f"the runs have different {what}: {told}"
+
+
+def _short(value: object) -> str:
+    return str(value)[:12]
+
+
+def as_csv(runs: Sequence[Path], results: Sequence[Results]) -> str:
+    """The final return of each task in each run, mean over seeds, with the optimum where it is known."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["task", "optimum", *map(str, runs)])
+    columns = [results[0].optimal_returns, *map(final_returns, results)]
+    for index, row in enumerate(zip(*columns, strict=True)):
+        numbers = ("" if np.isnan(number) else f"{number:.6g}" for number in row)
+        writer.writerow([index, *numbers])
+    return text.getvalue()

@@ -1,0 +1,74 @@
+"""Paired comparison of adaptations, on published results."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from envs.errors import UsageError
+from experiments.compare import CompareConfig, main
+from experiments.store.results import load_results
+
+RESULTS = Path(__file__).parent.parent / "results"
+UCB, PLAN = RESULTS / "maze15" / "ucb", RESULTS / "maze15" / "plan"
+
+
+def rows_of(text: str) -> list[list[str]]:
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()]
+
+
+def test_differences_are_paired_by_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    main(CompareConfig(runs=(UCB, PLAN, UCB), csv=tmp_path / "tasks.csv"))
+    done = capsys.readouterr()
+    assert "warning" not in done.err
+    _, _, first, plan, again = rows_of(done.out)
+    returns = {
+        folder: load_results(folder).eval_returns[:, :, -1].mean(axis=0) for folder in (UCB, PLAN)
+    }
+    change = returns[PLAN] - returns[UCB]
+    value, low, high = (float(part.strip("[],")) for part in plan[3].split())
+    assert value == pytest.approx(change.mean(), abs=1e-3)
+    assert 0 < low < value < high
+    better, equal, worse = (int(part) for part in plan[5].split("/"))
+    assert (better, worse) == (np.sum(change > 1e-6), np.sum(change < -1e-6))
+    assert better + equal + worse == 50
+    assert first[3:] == ["", "", ""]
+    assert again[3].startswith("0.000")
+    assert again[5] == "0 / 50 / 0"
+
+    head, *lines = (tmp_path / "tasks.csv").read_text().splitlines()
+    assert head == f"task,optimum,{UCB},{PLAN},{UCB}"
+    assert len(lines) == 50
+    cells = [float(cell) for cell in lines[7].split(",")]
+    assert cells == pytest.approx(
+        [7, load_results(UCB).optimal_returns[7], *(returns[f][7] for f in (UCB, PLAN, UCB))],
+        abs=1e-4,
+    )
+
+
+def test_what_makes_it_unequal_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(PLAN, other)
+    path = other / "summary.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "policy_sha256": "0" * 64}))
+    main(CompareConfig(runs=(UCB, other)))
+    said = capsys.readouterr().err
+    assert "warning: the runs have different weights" in said
+    assert f"{other} 000000000000" in said
+
+
+@pytest.mark.parametrize(
+    ("runs", "says"),
+    [
+        ((), "needs two result folders or more, found 0"),
+        ((UCB,), "found 1; usage"),
+        ((UCB, RESULTS / "gridworld" / "ucb"), "of different tasks"),
+    ],
+)
+def test_what_cannot_be_compared(runs: tuple[Path, ...], says: str) -> None:
+    with pytest.raises(UsageError, match=says):
+        main(CompareConfig(runs=runs))
