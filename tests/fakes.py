@@ -29,6 +29,7 @@ class FakeResults:
     num_episodes: int
     max_goals: int
     method: str = "ucb"
+    reached: None = None  # what a search has seen is not drawn
 
     @property
     def returns(self) -> np.ndarray:

@@ -106,7 +106,7 @@ def test_heads_differ_in_nothing_else(tiny: Path, monkeypatch: pytest.MonkeyPatc
     adapted: list[Path] = []
     monkeypatch.setattr(ablations, "train", lambda settings, go_on: asked.append(settings))
     monkeypatch.setattr(
-        ablations, "adapted", lambda config, policy, folders: adapted.extend(folders)
+        ablations, "adapted", lambda config, policy, folders, method: adapted.extend(folders)
     )
     lines = ablations.make(ReproduceConfig(what="heads", env=("kitchen",), steps=2))
     assert [line.label for line in lines] == ["gaussian", "fixed_gaussian", "mixture", "binned"]
@@ -243,11 +243,37 @@ def test_budgets_are_those_of_the_worlds_preset() -> None:
     assert "ablation" not in envs.find("gridworld").presets
 
 
+def test_the_plan_is_tried_without_each_of_its_parts(
+    tiny: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: dict[str, tuple[str, Any]] = {}
+
+    def adapted(
+        config: ReproduceConfig, policy: Path | None, folders: dict[Path, Any], method: str
+    ) -> None:
+        assert policy is None
+        ((folder, hyper),) = folders.items()
+        asked[folder.name] = (method, hyper)
+
+    monkeypatch.setattr(ablations, "adapted", adapted)
+    lines = ablations.make(ReproduceConfig(what="plan", seeds=1))
+    assert [line.results.name for line in lines] == list(asked)
+    assert asked["ucb-1seeds"] == ("ucb", methods.find("ucb").hyper())
+    assert asked["without-splicing-1seeds"][1].splice is False
+    assert asked["without-rehearsal-1seeds"][1].rehearse == 0
+    only = ablations.make(ReproduceConfig(what="plan", only=("without steering",)))
+    assert [line.label for line in only] == ["without steering"]
+    with pytest.raises(UsageError, match="there is no plan for gridworld"):
+        ablations.make(ReproduceConfig(what="plan", env=("gridworld",)))
+
+
 def test_table4_varies_length_and_constant(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: dict[Path, Any] = {}
 
-    def adapted(config: ReproduceConfig, policy: Path | None, folders: dict[Path, Any]) -> None:
-        assert policy is None
+    def adapted(
+        config: ReproduceConfig, policy: Path | None, folders: dict[Path, Any], method: str
+    ) -> None:
+        assert (policy, method) == (None, "ucb")
         asked.update(folders)
 
     monkeypatch.setattr(ablations, "adapted", adapted)
