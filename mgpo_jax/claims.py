@@ -156,6 +156,8 @@ def check_place(path: Path, flag: str = "--out", num_bytes: int = 1 << 20) -> No
             place = place.parent
         too_long = longest + len(".partial") > os.pathconf(place, "PC_NAME_MAX")
         free = shutil.disk_usage(place).free
+    except FileNotFoundError:  # another process has removed it since
+        return check_place(path, flag, num_bytes)
     except OSError as error:
         raise UsageError(f"{flag} {printable(str(path))}: {error.strerror}") from None
     fault = None
@@ -167,8 +169,11 @@ def check_place(path: Path, flag: str = "--out", num_bytes: int = 1 << 20) -> No
         fault = f"{place} is not writable"
     elif free < num_bytes:
         fault = f"{place} has {free / 1e6:.1f} MB free, {num_bytes / 1e6:.0f} MB are needed"
+    if fault and not os.path.lexists(place):
+        return check_place(path, flag, num_bytes)
     if fault:
         raise UsageError(f"{flag} {printable(str(path))}: {fault}; choose another place")
+    return None
 
 
 @contextmanager
