@@ -112,7 +112,11 @@ CONTRADICTIONS: dict[str, tuple[tuple[str, str], ...]] = {
     ),
     "check": (("--env gridworld", "gridworld"), ("nowhere", "nowhere"), ("policy", "policy")),
     "table": (("nowhere", "nowhere"), ("result nowhere", "nowhere"), ("policy", "policy")),
-    "compare": (("nowhere", "nowhere"), ("policy", "policy"), ("--csv nowhere/new.csv", "nowhere")),
+    "compare": (
+        ("nowhere result", "nowhere"),
+        ("policy result", "policy"),
+        ("--csv nowhere/new.csv", "nowhere"),
+    ),
     "plot": (
         ("--seed 1", "--seed"),
         ("--tasks 2", "--tasks"),
