@@ -10,7 +10,7 @@ from typing import NoReturn
 
 import tyro
 
-from envs.errors import UsageError
+from envs.errors import UsageError, printable
 from experiments.runtime import Common, refuse_existing_file, run, say
 
 
@@ -27,8 +27,9 @@ class CompareConfig(Common):
 def main(config: CompareConfig) -> None:
     """Say task by task how adaptations differ from the first of them, with 95 % intervals."""
     if len(config.runs) < 2:
+        found = "".join(printable(str(folder)) for folder in config.runs) or "none"
         raise UsageError(
-            f"comparing needs two result folders or more, found {len(config.runs)}; usage: "
+            f"comparing needs two result folders or more, found {found}; usage: "
             "python -m experiments.compare RUN_DIR RUN_DIR ..."
         )
     if config.csv is not None:

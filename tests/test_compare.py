@@ -64,8 +64,8 @@ def test_what_makes_it_unequal_is_said(tmp_path: Path, capsys: pytest.CaptureFix
 @pytest.mark.parametrize(
     ("runs", "says"),
     [
-        ((), "needs two result folders or more, found 0"),
-        ((UCB,), "found 1; usage"),
+        ((), "needs two result folders or more, found none"),
+        ((UCB,), "found .*ucb; usage"),
         ((UCB, RESULTS / "gridworld" / "ucb"), "of different tasks"),
     ],
 )
