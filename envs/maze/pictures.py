@@ -39,6 +39,7 @@ PROMPT_COLOR = VERMILION
 AGENT_COLOR = BLUE
 START_COLOR = PAPER
 GOAL_COLOR = YELLOW
+SEEN_ON_DARK = (Stroke(linewidth=2.6, foreground="white"), Normal())
 VISIT_COLORS = LinearSegmentedColormap.from_list(
     "visits", ["#EAE6F3", "#C3B7DC", "#9A86C2", "#704FA3", "#48237F", "#260B4D"]
 )
@@ -161,12 +162,11 @@ def walk_of(episode: Episode, side: int, start: Cell) -> np.ndarray:
 def visit_counts(episodes: Episode, maze: np.ndarray, start: Cell) -> np.ndarray:
     """Mean visits of each cell in one of a batch of episodes, the start included."""
     goals, lengths = episodes.trajectory.achieved_goals, episodes.trajectory.length
-    cells = np.rint(np.asarray(goals) * len(maze)).astype(int)
-    happened = np.arange(cells.shape[1]) < np.asarray(lengths)[:, None]
-    counts = np.zeros(maze.shape)
-    np.add.at(counts, tuple(cells[happened].T), 1.0)
-    counts[tuple(start)] += len(cells)
-    return counts / len(cells)
+    goals = np.asarray(goals)
+    happened = np.arange(goals.shape[1]) < np.asarray(lengths)[:, None]
+    counts = reached_counts(goals[happened], maze)
+    counts[tuple(start)] += len(goals)
+    return counts / len(goals)
 
 
 def reached_counts(goals: np.ndarray, maze: np.ndarray) -> np.ndarray:
@@ -241,9 +241,8 @@ def draw_maze(
     ax.imshow(_cell_colors(maze, visits, norm), interpolation="nearest", zorder=0)
     for path in paths or ():
         rows, columns = np.asarray(path, float).reshape(-1, 2).T
-        seen_on_dark = [Stroke(linewidth=2.6, foreground="white"), Normal()]
         ax.plot(
-            columns, rows, color=AGENT_COLOR, linewidth=1.4, zorder=1, path_effects=seen_on_dark
+            columns, rows, color=AGENT_COLOR, linewidth=1.4, zorder=1, path_effects=SEEN_ON_DARK
         )
     _draw_markers(ax, side, _markers(side, start, goal, prompts), lanes)
 

@@ -167,7 +167,7 @@ def _next_query(tools: Tools, key: PRNGKeyArray, state: MapState) -> tuple[Query
         drawn = sample_prompt(
             key_search, way.goals, state.task_goal, space.num_slots, space.longest
         )
-        found = found._replace(hopeful=Offer(drawn, known, may_gain))
+        found = found._replace(hopeful=Offer(drawn, may_gain))
     explores, frontier = explore(key_explore, tools, state, way)
     hopes = found.hopeful.exists & (turn % 2 == 0)
     greedy = (turn == 0) | found.sure.exists | hopes

@@ -210,6 +210,8 @@ def without(prompt: Prompt, slot: Int[Array, ""]) -> Prompt:
 class OrderState(NamedTuple):
     """The plan between two episodes."""
 
+    key: PRNGKeyArray
+    """For what is planned; ``tell`` is given none."""
     task_goal: Float[Array, "G"]
     order: Order
     first: Int[Array, ""]
@@ -228,7 +230,6 @@ class OrderState(NamedTuple):
     """The sum of their returns."""
     num_variants: Int[Array, ""]
     """Variants tried, those with moved goals included."""
-    num_asked: Int[Array, ""]
 
 
 def plan_order(space: SearchSpace) -> PromptOptimizer:
@@ -236,9 +237,9 @@ def plan_order(space: SearchSpace) -> PromptOptimizer:
     num_slots = space.num_slots
 
     def init(key: PRNGKeyArray, task_goal: Float[Array, "G"]) -> OrderState:
-        del key
         goal_dim = task_goal.shape[-1]
         return OrderState(
+            key=key,
             task_goal=task_goal,
             order=no_order(max(num_slots - 1, 1), goal_dim),
             first=jnp.int32(NONE),
@@ -249,7 +250,6 @@ def plan_order(space: SearchSpace) -> PromptOptimizer:
             pulls=jnp.zeros(num_slots),
             earned=jnp.zeros(num_slots),
             num_variants=jnp.int32(0),
-            num_asked=jnp.int32(0),
         )
 
     def best(state: OrderState) -> Prompt:
@@ -272,7 +272,6 @@ def _ask(space: SearchSpace, key: PRNGKeyArray, state: OrderState) -> tuple[Quer
         first=jnp.where(complete, NONE, state.planned_first),
         variant=jnp.where(complete, variant, NONE),
         num_variants=state.num_variants + complete,
-        num_asked=state.num_asked + 1,
     )
 
 
@@ -284,12 +283,11 @@ def _tell(space: SearchSpace, state: OrderState, query: Query, episode: Episode)
     row = jnp.where(same & (state.first != NONE), state.first, MAX_GOALS)
     order = order._replace(tried=order.tried.at[row].add(1.0, mode="drop"))
     variant = jnp.where(state.variant == NONE, len(state.pulls), state.variant)
-    key = jax.random.fold_in(jax.random.key(0), state.num_asked)
-    key = jax.random.fold_in(key, jnp.sum(episode.trajectory.length))
-    key_first, key_rest = jax.random.split(key)
+    key, key_first, key_rest = jax.random.split(state.key, 3)
     first = next_goal(key_first, order)
     planned = plan_prompt(key_rest, order, first, state.task_goal, space.num_slots, space.longest)
     return state._replace(
+        key=key,
         order=order,
         planned=planned,
         planned_first=first,

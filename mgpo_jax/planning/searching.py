@@ -24,7 +24,7 @@ from mgpo_jax.planning.rehearsal import (
     rehearse,
 )
 from mgpo_jax.planning.steering import deficits, lead_along, steer
-from mgpo_jax.planning.table import FAR, Table, Way
+from mgpo_jax.planning.table import Table, Way
 from mgpo_jax.planning.trials import is_tried
 from mgpo_jax.policy import Policy
 from mgpo_jax.prompts import Prompt, single_goal
@@ -95,7 +95,6 @@ class Offer(NamedTuple):
     """The best prompt of one kind that a search has found."""
 
     prompt: Prompt
-    steps: Int[Array, ""]
     exists: Bool[Array, ""]
 
 
@@ -120,7 +119,7 @@ class Pool(NamedTuple):
 def nothing_found(memory: Memory) -> Found:
     """What is found without a search."""
     prompt = jax.tree.map(lambda rows: rows[0], memory.kept)
-    nothing = Offer(prompt, jnp.int32(FAR), jnp.zeros((), bool))
+    nothing = Offer(prompt, jnp.zeros((), bool))
     return Found(memory, nothing, nothing, jnp.int32(0))
 
 
@@ -277,7 +276,7 @@ def _rows(tree: Any, num: int) -> Any:
 def _offer(pool: Pool, which: Bool[Array, "C"]) -> Offer:
     index, exists = any_of(which, pool.rehearsal.rank)
     prompt = jax.tree.map(lambda rows: rows[index], pool.prompts)
-    return Offer(prompt, pool.rehearsal.steps[index], exists)
+    return Offer(prompt, exists)
 
 
 def _best(pool: Pool) -> Pool:
