@@ -418,6 +418,15 @@ def test_the_hidden_order_is_found(orders):
     assert solved_after.max() <= 11
 
 
+def test_searches_of_one_order_draw_plans_of_their_own():
+    keys = jax.random.split(jax.random.key(5), 6)
+    hidden = jnp.broadcast_to(jnp.arange(NUM_GOALS), (6, NUM_GOALS))
+    search = partial(order_search, num_episodes=3, deterministic=False)
+    _, (query, *_) = jax.jit(jax.vmap(search))(keys, hidden)
+    second = np.asarray(query.prompt.goals)[:, 1].reshape(6, -1)
+    assert len(np.unique(second, axis=0)) > 2
+
+
 def test_what_was_ruled_out_is_never_tried_again(orders):
     _, (_, first, before, _) = orders
     for lane in range(len(first)):

@@ -161,9 +161,8 @@ def walk_of(episode: Episode, side: int, start: Cell) -> np.ndarray:
 
 def visit_counts(episodes: Episode, maze: np.ndarray, start: Cell) -> np.ndarray:
     """Mean visits of each cell in one of a batch of episodes, the start included."""
-    goals, lengths = episodes.trajectory.achieved_goals, episodes.trajectory.length
-    goals = np.asarray(goals)
-    happened = np.arange(goals.shape[1]) < np.asarray(lengths)[:, None]
+    goals = np.asarray(episodes.trajectory.achieved_goals)
+    happened = np.arange(goals.shape[1]) < np.asarray(episodes.trajectory.length)[:, None]
     counts = reached_counts(goals[happened], maze)
     counts[tuple(start)] += len(goals)
     return counts / len(goals)
