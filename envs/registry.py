@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 from envs.errors import DataError, UsageError, nearest, printable, shown
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from envs.base import Demonstrator, Environment, ObsLayout
     from envs.drawing import Pictures
     from envs.official import Official
@@ -52,6 +54,30 @@ class Judgement:
             )
 
 
+@dataclass(frozen=True, kw_only=True)
+class StepCost:
+    """How episodes are paid where the task is to arrive somewhere in as few steps as possible.
+
+    The return of a single episode then says whether it arrived, and after how many steps.
+
+    Attributes:
+      step: what each step costs.
+      arrival: what arriving pays; it ends the episode.
+      horizon: the most steps of an episode.
+    """
+
+    step: float
+    arrival: float
+    horizon: int
+
+    def num_steps(self, returns: np.ndarray) -> np.ndarray:
+        """Steps of single episodes with these returns until they arrived; infinity where they did not."""
+        import numpy as np
+
+        steps = np.rint((self.arrival - np.asarray(returns, np.float64)) / self.step)
+        return np.where(steps <= self.horizon, steps, np.inf)
+
+
 def _no_demonstrators(env: Environment) -> Mapping[str, Demonstrator]:
     return {}
 
@@ -75,6 +101,8 @@ class World:
       judged: how policies are judged here; every table follows it.
       method_defaults: what the world changes in the default hyper-parameters of methods, by the name of the
         method, such as the unit of returns in which a bandit counts.
+      step_cost: how episodes are paid where the task is to arrive in as few steps as possible; tables then
+        have a success rate and SPL [None: it is another task].
       num_test_tasks: how many tasks are kept for test.
       official: the program by others that this world re-implements, to compare it with [none].
     """
@@ -89,6 +117,7 @@ class World:
     policy_of: str | None = None
     judged: Judgement = field(default_factory=Judgement)
     method_defaults: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    step_cost: StepCost | None = None
     num_test_tasks: int = 50
     official: Callable[[Any], Official] | None = None
 

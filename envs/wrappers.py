@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from envs.base import Engine, Environment, EnvSpec, State, Task, TimeStep
+from envs.errors import UsageError
 
 
 @dataclass(frozen=True)
@@ -162,3 +163,20 @@ class Noisy(Wrapper):
             draw = jax.random.uniform(jax.random.fold_in(key, 1), shape, minval=-1.0)
             noise += jnp.asarray(self.obs_range).reshape(shape) * draw
         return timestep._replace(obs=timestep.obs + noise.astype(dtype))
+
+
+def behind_noise(
+    env: Environment, obs_noise: float = 0.0, action_noise: float = 0.0
+) -> Environment:
+    """A world behind noise of these sizes (``Noisy``), and the world itself where both are 0.
+
+    Raises:
+      UsageError: if the world cannot be behind such noise.
+    """
+    if not (obs_noise or action_noise):
+        return env
+    try:
+        return Noisy(env, obs_noise, action_noise)
+    except ValueError as error:
+        name = "--action-noise" if action_noise else "--obs-noise"
+        raise UsageError(f"{name}: {error}; give another size") from None

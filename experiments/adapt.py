@@ -47,11 +47,12 @@ def main(config: AdaptConfig) -> None:
     if not (config.resume and os.path.isdir(folder)):
         refuse_existing(folder, "remove it", "choose another with --out")
     world = envs.find(config.env)
+    from envs.wrappers import behind_noise
     from experiments.adaptation import adapt_and_save, chosen_tasks, finished
     from experiments.store.summary import printed
     from mgpo_jax.policy_files import load_policy
 
-    env = envs.make(config.env)
+    env = behind_noise(envs.make(config.env), config.obs_noise, config.action_noise)
     policy = load_policy(world, config.policy, methods.find(config.method).policy)
     tasks = chosen_tasks(world, env, config.tasks, config.validation, config.validation_seed)
     if folder.is_dir():

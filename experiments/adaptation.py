@@ -20,7 +20,7 @@ from experiments.store.provenance import provenance
 from experiments.store.results import Results, load_results, results_of, write_results
 from experiments.store.runs import changes
 from experiments.store.settings import AdaptConfig
-from experiments.store.summary import ADAPT_AGAIN, summarize
+from experiments.store.summary import ADAPT_AGAIN, judged_episodes, summarize
 from experiments.store.work import PIECES, long_work
 from mgpo_jax import methods
 from mgpo_jax.files import hash_arrays, new_folder, remove_leftovers, to_json
@@ -54,9 +54,9 @@ def adapt_all(
     What is finished is kept in ``journal``.
     """
     first = configs[0]
-    judged = world.judged
-    if first.eval_episodes is not None:
-        judged = dataclasses.replace(judged, episodes=first.eval_episodes)
+    num_judged = judged_episodes(to_json(first), world)
+    assert num_judged is not None
+    judged = dataclasses.replace(world.judged, episodes=num_judged)
     return sweep(
         env,
         policy,
@@ -80,6 +80,9 @@ NOT_DECIDING = ("debug", "figures", "out", "policy", "resume", "tasks")
 def deciding(config: AdaptConfig, policy: LoadedPolicy, tasks: Task) -> dict[str, Any]:
     """Everything that decides about the results of an adaptation, as JSON values."""
     settings = {k: v for k, v in to_json(config).items() if k not in NOT_DECIDING}
+    for name in ("obs_noise", "action_noise"):  # work that was begun before there was noise goes on
+        if not settings[name]:
+            del settings[name]
     hashes = {"policy_sha256": policy.sha256, "tasks_sha256": hash_arrays(task_arrays(tasks))}
     return {**settings, **hashes}
 

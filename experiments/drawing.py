@@ -95,7 +95,7 @@ def pictures_together(
 
 def player_of(results: Results, policy_folder: Path | None = None) -> Play:
     """Who plays episodes under prompts: the policy that an adaptation was made with."""
-    world, env = envs.find(results.env), envs.make(results.env)
+    world, env = envs.find(results.env), results.environment
     policy = load_policy_of(results, world, policy_folder)
 
     def play_goals(key: jax.Array, task: Any, goals: np.ndarray, num: int, greedy: bool) -> Episode:

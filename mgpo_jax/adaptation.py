@@ -42,6 +42,9 @@ class Adapter(NamedTuple):
     tell_in_turn: bool = False
     """Whether tasks that adapt side by side update one after the other, which saves memory where an
     update is large."""
+    num_scored: Callable[[Any], Int[Array, ""]] | None = None
+    """``(state) -> number`` of prompts that it scored so far by asking the policy, without an episode; None
+    for those that learn by episodes alone."""
 
 
 class AdaptState(NamedTuple):
@@ -74,6 +77,8 @@ class AdaptLog(NamedTuple):
     """The best choice after each round, [R, ..]."""
     played: Played
     """The episodes, [R, K, ..]."""
+    num_scored: Int[Array, "*batch R"] | None = None
+    """Prompts that were scored without an episode until the end of each round; None where none can be."""
 
 
 class Judged(NamedTuple):
@@ -239,6 +244,7 @@ def _round(
             actions=small_actions(env.spec, episodes) if kept else None,
             goals=episodes.trajectory.goals,
         ),
+        num_scored=None if adapter.num_scored is None else adapter.num_scored(after),
     )
     return AdaptState(key, after), log
 

@@ -92,6 +92,9 @@ class Outcome(NamedTuple):
     eval_achieved: np.ndarray | None = None
     """``[S, N, C, M]``: share of the judging episodes that achieved each of the world's M named goals; None
     in worlds without any (``Environment.goal_names``)."""
+    num_scored: np.ndarray | None = None
+    """``[S, N, R]``: prompts scored without an episode until the end of each round; None for methods that
+    learn by episodes alone."""
 
 
 def together(env: Environment, function: Callable, in_axes: Any = 0) -> Any:
@@ -443,6 +446,7 @@ class Record(NamedTuple):
             num_failed=int(num_failed),
             cpu_seconds=cpu_seconds,
             eval_achieved=_by_judgement(jax.tree.map(of_variant, self.judged.achieved)),
+            num_scored=jax.tree.map(of_variant, self.log.num_scored),
         )
 
 

@@ -11,11 +11,15 @@ import numpy as np
 import pytest
 
 from envs.base import Environment
+from envs.maze import MAZE15 as MAZE15_WORLD
+from envs.maze import MAZE30 as MAZE30_WORLD
 from envs.maze.env import (
     EAST,
+    GOAL_REWARD,
     NORTH,
     SOUTH,
     STAY,
+    STEP_PENALTY,
     WEST,
     MazeRunner,
     MazeTask,
@@ -229,6 +233,18 @@ class TestOptimalReturn:
             assert found == pytest.approx(best, abs=1e-5), goal
         cut_off = task._replace(maze=task.maze.at[1, 4].set(1))
         assert optimal_return(TINY, cut_off) == pytest.approx(-1.2)
+
+    @pytest.mark.parametrize("world", [MAZE15_WORLD, MAZE30_WORLD], ids=lambda world: world.name)
+    def test_its_steps_can_be_told_from_a_return(self, world):
+        env = world.make()
+        longest = jnp.full(env.horizon, STAY)
+        task = jax.tree.map(lambda leaf: leaf[0], sample_tasks(env, 1))
+        _, _, steps = walk(env, task, longest)
+        assert world.step_cost.num_steps(float(steps.reward.sum())) == np.inf
+        shortest = int(env._shortest_path(task))
+        assert world.step_cost.num_steps(float(optimal_return(env, task))) == shortest
+        at_last = float(GOAL_REWARD - STEP_PENALTY * env.horizon)
+        assert world.step_cost.num_steps(at_last) == env.horizon
 
     def test_matches_networkx_and_the_known_mean(self, tasks15):
         returns = np.asarray(jax.jit(jax.vmap(MAZE15.optimal_return))(tasks15))

@@ -13,7 +13,8 @@ from scipy import stats
 
 import envs
 from envs.base import ArraySpec, Box, Environment, EnvSpec, ObsLayout, TimeStep
-from envs.wrappers import Noisy
+from envs.errors import UsageError
+from envs.wrappers import Noisy, behind_noise
 
 MAZE = envs.make("maze15")
 NUM = 2000
@@ -130,6 +131,15 @@ def test_refuses_what_is_no_noise():
         Noisy(Echo(), obs_range=(0.0, -1.0, 2.0))
     with pytest.raises(ValueError, match="of which echo has 3, found 2"):
         Noisy(Echo(), obs_range=(0.1, 0.1))
+
+
+def test_a_world_behind_no_noise_is_itself():
+    assert behind_noise(MAZE) is MAZE
+    assert behind_noise(MAZE, 0.1, 0.2) == Noisy(MAZE, 0.1, 0.2)
+    with pytest.raises(
+        UsageError, match=r"--action-noise: .* a probability, found 2.0; give another"
+    ):
+        behind_noise(MAZE, 0.0, 2.0)
 
 
 def test_codes_take_no_noise():

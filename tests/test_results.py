@@ -21,6 +21,7 @@ from envs.errors import DataError, UsageError
 from envs.gridworld.env import GridWorld
 from envs.maze.env import MazeRunner
 from envs.registry import WORLDS, Judgement, World
+from envs.wrappers import behind_noise
 from experiments.store.metrics import read_metrics
 from experiments.store.policies import load_policy_of
 from experiments.store.results import PARTS, Results, load_results, results_of, save_results
@@ -505,6 +506,23 @@ def test_episodes_in_a_world_of_chance_can_be_played_again(tmp_path: Path) -> No
         assert episode.trajectory.length == real.sum()
         starts.add(tuple(episode.trajectory.obs[0].tolist()))
     assert len(starts) > 10
+
+
+@pytest.mark.parametrize("noise", [{"obs_noise": 0.1}, {"action_noise": 0.5}])
+def test_episodes_behind_noise_can_be_played_again(noise: dict[str, float], tmp_path: Path) -> None:
+    """The settings of results say behind which noise their world was."""
+    policy_in(tmp_path / "policy", 0)
+    policy, made = read_policy(tmp_path / "policy"), made_results()
+    env = behind_noise(ENV, **noise)
+    outcome = adapt(env, policy, made.task_set, "plan", seeds=1, episodes=3, eval_every=3)
+    settings = {"env": "tiny", "method": "plan", **noise}
+    save(tmp_path / "run", results_of(outcome, settings, env, made.task_set, np.ones(2)))
+    found = load_results(tmp_path / "run")
+    assert found.environment == env
+    np.testing.assert_array_equal(found.num_scored, outcome.num_scored)
+    for place in np.ndindex(found.returns.shape):
+        assert found.replay(*place).return_ == found.returns[place]
+    assert made.environment is ENV
 
 
 def summary_of(results: Results, sha256: str = "0" * 64) -> dict[str, Any]:

@@ -10,9 +10,11 @@ from made_results import made_results
 from scipy.stats import bootstrap, mannwhitneyu, trim_mean
 
 from envs.errors import UsageError
+from envs.registry import StepCost
 from experiments.store.statistics import (
     MOST_PARTS,
     Interval,
+    arrivals,
     compare,
     gain_over_tasks,
     interquartile_mean,
@@ -212,6 +214,17 @@ def test_a_gain_is_paired_and_its_interval_over_tasks() -> None:
     assert gain[1:] == pytest.approx(tuple(wanted.confidence_interval), abs=0.03)
     assert gain_over_tasks(a, b) == gain
     assert gain_over_tasks(a[:, :1], b[:, :1]) == Interval(pytest.approx(each[0]), None, None)
+
+
+def test_arrivals_by_hand() -> None:
+    """Of a shortest way of 5 steps and one of 8, walked in 5, 10 and 8 steps, and once not at all."""
+    cost = StepCost(step=0.1, arrival=1.0, horizon=20)
+    returns = np.float32([[0.5, -2.0], [0.0, 0.2]])
+    assert cost.num_steps(returns).tolist() == [[5, np.inf], [10, 8]]
+    found = arrivals(returns, np.float32([0.5, 0.2]), cost)
+    assert found == (0.75, pytest.approx((1 + 0 + 0.5 + 1) / 4))
+    nobody = arrivals(np.float32([[-2.0]]), np.float32([-2.0]), cost)  # out of everybody's reach
+    assert nobody == (0.0, 0.0)
 
 
 def test_the_score_of_crafter() -> None:

@@ -178,9 +178,9 @@ def test_parts_are_unknown_where_an_older_world_is_not_installed(
 
 def test_a_table_has_columns_of_parts_where_a_row_has_them(with_parts: Path) -> None:
     mazes, kitchen = read_row(ONE_PUBLISHED), read_row(with_parts)
-    assert list(cells(mazes)) == list(HEAD)
+    assert list(cells(mazes)) == [*HEAD, "success rate", "SPL"]
     lines = [line.split(" | ") for line in comparison([mazes, kitchen]).splitlines()]
-    assert {len(line) for line in lines} == {len(HEAD) + 5}
+    assert {len(line) for line in lines} == {len(HEAD) + 2 + 5}
     assert lines[0][-5:] == ["p1", "p2", "p3", "p4", "p5 |"]
     assert lines[2][-5:] == ["", "", "", "", " |"]
     assert lines[3][-5:] == ["1.00 (75)", "0.89 (75)", "0.77 (69)", "0.72 (57)", "0.50 (24) |"]
@@ -578,7 +578,7 @@ def test_folders_are_escaped(tmp_path: Path) -> None:
     text = comparison([read_row(folder)])
     assert len(text.splitlines()) == 3
     assert r"a\|b\nc\x1b[31m" in text
-    assert len(re.findall(r"(?<!\\)\|", text.splitlines()[2])) == len(HEAD) + 1
+    assert len(re.findall(r"(?<!\\)\|", text.splitlines()[2])) == len(HEAD) + 2 + 1
 
 
 @pytest.mark.parametrize("suffix", [".md", ".png", ".gif"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from envs.registry import World
+from envs.registry import StepCost, World
 
 if TYPE_CHECKING:
     from envs.base import Demonstrator
@@ -60,6 +60,7 @@ MAZE15 = World(
     },
     pictures=load_pictures,
     page=load_page,
+    step_cost=StepCost(step=0.1, arrival=1.0, horizon=64),
 )
 
 MAZE30 = World(
@@ -81,4 +82,5 @@ MAZE30 = World(
     },
     pictures=load_pictures,
     page=load_page,
+    step_cost=StepCost(step=0.1, arrival=1.0, horizon=500),
 )

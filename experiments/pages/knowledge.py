@@ -92,7 +92,7 @@ def _adapter_of(results: Results) -> Adapter | None:
     try:
         method = METHODS.known(results.method, results.folder or CONFIG)
         hyper = method.hyper_from(values)
-        env = results.world.make()
+        env = results.environment
         setting = Setting(
             env=env,
             network=network_config(env.spec, max_prompt_length=slots),

@@ -239,9 +239,13 @@ def _new_or_known(numbers: np.ndarray) -> np.ndarray:
 
 
 def _actions(results: Results, page: Page) -> dict[str, np.ndarray]:
-    """The actions of all episodes one after another, for a world whose rules are in the page."""
+    """The actions of all episodes one after another, for a world whose rules are in the page.
+
+    Behind noise there are none: the rules do not know what it did to the actions.
+    """
     actions = results.actions
-    if page.script is None or actions is None or actions.dtype.kind == "f":
+    noisy = results.environment != results.world.make()
+    if page.script is None or actions is None or actions.dtype.kind == "f" or noisy:
         return {}
     real = actions != np.iinfo(actions.dtype).max
     found = {"lengths": smallest(real.sum(axis=-1)), "actions": smallest(actions[real])}

@@ -28,6 +28,7 @@ from envs.base import Environment, Episode, Task
 from envs.episodes import replay
 from envs.errors import DataError, shown
 from envs.registry import WORLDS, World
+from envs.wrappers import behind_noise
 from experiments.store.layout import ARRAYS, CONFIG, META, SUMMARY, TASKS
 from experiments.store.provenance import Place, provenance, read_meta
 from experiments.store.summary import ADAPT_AGAIN, read_summary
@@ -46,7 +47,7 @@ from mgpo_jax.schema import (
     read_arrays,
     read_document,
 )
-from mgpo_jax.settings import Count, NumEpisodes, NumSeeds, Seed
+from mgpo_jax.settings import Count, NotNegative, NumEpisodes, NumSeeds, Seed
 from mgpo_jax.tasks import save_tasks, task_arrays, task_at, tasks_from
 from mgpo_jax.trees import named_leaves
 
@@ -78,6 +79,7 @@ FIELDS = {
     "eval_episodes": _field("C", "int64", low=1),
     "eval_returns": _field("SNC", "float32"),
     "eval_achieved": _field("SNCM", "float32", required=False, low=0, high=1),
+    "num_scored": _field("SNR", "int32", required=False, low=0),
     "optimal_returns": _field("N", "float32", required=False),
     "task_goals": _field("NG", "float32", required=False),
     "num_parts": _field("N", "integers", required=False, low=0),
@@ -124,6 +126,9 @@ class Results:
     eval_achieved: np.ndarray | None = None
     """[S, N, C, M] shares of the judging episodes that achieved each of the world's M named goals; None in
     worlds without any."""
+    num_scored: np.ndarray | None = None
+    """[S, N, R] prompts scored without an episode until the end of each round; None for methods that learn
+    by episodes alone."""
     lengths: np.ndarray | None = None
     """[S, N, E] steps of the episodes."""
     keys: np.ndarray | None = None
@@ -157,6 +162,14 @@ class Results:
         """The record of the world; a place in a file is not imported."""
         where = "the results" if self.folder is None else self.folder / CONFIG
         return WORLDS.known(self.env, where, "--env")
+
+    @cached_property
+    def environment(self) -> Environment:
+        """The world as it was adapted in, behind noise where there was some."""
+        config = self.config
+        return behind_noise(
+            self.world.make(), config.get("obs_noise", 0.0), config.get("action_noise", 0.0)
+        )
 
     @cached_property
     def task_set(self) -> Task:
@@ -217,7 +230,7 @@ class Results:
                 "these results hold no actions; adapt again, with --keep-actions where they are continuous"
             )
         where = (seed, task, episode)
-        env, actions = self.world.make(), self.actions[where]
+        env, actions = self.environment, self.actions[where]
         if self.lengths is not None:
             length = int(self.lengths[where])
         else:  # the largest number of the type stands after the end
@@ -252,6 +265,7 @@ def results_of(
         eval_returns=outcome.eval_returns,
         optimal_returns=optimum,
         eval_achieved=outcome.eval_achieved,
+        num_scored=outcome.num_scored,
         lengths=outcome.lengths,
         keys=None if env.spec.deterministic else outcome.keys,
         actions=outcome.actions,
@@ -287,6 +301,8 @@ def write_results(place: Path, results: Results, folder: Path, meta: Mapping[str
         arrays["optimal_returns"] = results.optimal_returns
     if results.eval_achieved is not None:
         arrays["eval_achieved"] = results.eval_achieved
+    if results.num_scored is not None:
+        arrays["num_scored"] = results.num_scored
     if results.lengths is not None:
         arrays["lengths"] = results.lengths.astype(np.min_scalar_type(results.lengths.max()))
     if results.keys is not None:
@@ -340,6 +356,8 @@ class Config(BaseModel):
     seed: Seed = 0
     eval_every: Count | None = None
     eval_episodes: Count | None = None
+    obs_noise: NotNegative = 0.0
+    action_noise: NotNegative = 0.0
     max_goals: Count | None = None
     keep_rewarded: bool = True
     keep_actions: bool = False
@@ -408,6 +426,7 @@ def load_results(folder: Path, parts: Collection[str] = PARTS) -> Results:
         eval_returns=arrays["eval_returns"],
         optimal_returns=np.full(num_tasks, np.nan) if optimum is None else optimum,
         eval_achieved=arrays.get("eval_achieved"),
+        num_scored=arrays.get("num_scored"),
         lengths=arrays.get("lengths"),
         keys=arrays.get("keys"),
         actions=arrays.get("actions"),

@@ -28,10 +28,12 @@ from experiments.store.statistics import (
 )
 from experiments.store.summary import (
     ADAPT_AGAIN,
+    DECIDING,
     Summary,
     check_against,
     judged_once,
     method_of,
+    of_arrivals,
     read_summary,
 )
 from experiments.store.tables import number, shortened, table
@@ -46,6 +48,8 @@ SHOWN = (
     "validation_seed",
     "eval_every",
     "eval_episodes",
+    "obs_noise",
+    "action_noise",
 )  # settings that every method has
 STATED = {"seed", "eval_every"}  # may differ beside the paper's number, since the row states it
 
@@ -86,9 +90,11 @@ def read_row(folder: Path) -> Row:
     # A place is not imported: what it is of stays unknown.
     world = WORLDS.find(summary["env"]) if summary["env"] in WORLDS.names() else None
     single = judged_once(config, world)
-    check_against(folder / ARRAYS, summary, single)
+    check_against(folder / ARRAYS, summary, single, world)
     if "part_shares" not in summary:
         summary["part_shares"] = _shares_of_older(folder, summary) if world and single else None
+    if "spl" not in summary and single and world and world.step_cost:
+        summary.update(_arrivals_of_older(folder, world))  # type: ignore[typeddict-item]
     return Row(
         folder=str(folder),
         summary=summary,
@@ -112,6 +118,15 @@ def _shares_of_older(folder: Path, summary: Summary) -> list[tuple[float, int]] 
         shares = part_shares(results.eval_returns[:, :, -1], results.num_parts)
         return None if shares is None else [(share, num) for share, num in shares]
     return None
+
+
+def _arrivals_of_older(folder: Path, world: World) -> dict[str, Any]:
+    """Success rate and SPL of an older version's results, which follow from what is there."""
+    fields = {name: DECIDING[name] for name in ("eval_returns", "optimal_returns")}
+    arrays = read_arrays(
+        folder / ARRAYS, fields, dict.fromkeys("SNC", range(1, 2**31)), ADAPT_AGAIN
+    )
+    return of_arrivals(arrays["eval_returns"], arrays.get("optimal_returns"), world)
 
 
 def kind_of_tasks(path: Path, config: Mapping[str, Any], world: World | None) -> str:
@@ -192,6 +207,9 @@ HEAD = (
 
 
 FURTHER: Mapping[str, tuple[str, Callable[[Summary], str]]] = {
+    "prompts scored": ("prompts_scored", lambda summary: f"{summary['prompts_scored']:.0f}"),
+    "success rate": ("success_rate", lambda summary: f"{100 * summary['success_rate']:.1f} %"),
+    "SPL": ("spl", lambda summary: f"{summary['spl']:.3f}"),
     "best single episode": ("fresh", lambda summary: f"{summary['best_episode_return']:.2f}"),
     "fresh": (
         "fresh",

@@ -31,6 +31,7 @@ from mgpo_jax.settings import (
     EncoderName,
     Head,
     Name,
+    NotNegative,
     NumEpisodes,
     NumGoals,
     NumLayers,
@@ -442,10 +443,14 @@ class AdaptConfig(Common):
     """Episodes between evaluations of the best choice, which are outside of the budget."""
     eval_episodes: NumEpisodes | None = None
     """Episodes that an evaluation averages (default: as the world's record says)."""
+    obs_noise: NotNegative = 0.0
+    """Standard deviation of noise on observations, in their units: search and evaluations run behind it."""
+    action_noise: NotNegative = 0.0
+    """That of noise on actions; where they are discrete, the probability of a random one."""
     keep_actions: bool = False
     """Also keep continuous actions in the results; discrete ones are always kept."""
     out: Path | None = None
-    """Result folder (default: runs/adapt/ENV/METHOD-seedSEED)."""
+    """Result folder (default: runs/adapt/ENV/METHOD-seedSEED, with the noise behind it)."""
     figures: bool = True
     """Draw the figures."""
     resume: bool = False
@@ -456,6 +461,8 @@ class AdaptConfig(Common):
     @property
     def folder(self) -> Path:
         name = f"{file_name(self.method)}-seed{self.seed}"
+        name += f"-obs{self.obs_noise:g}" if self.obs_noise else ""
+        name += f"-action{self.action_noise:g}" if self.action_noise else ""
         return self.out or RUNS / "adapt" / file_name(self.env) / name
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from envs.errors import UsageError
 
 if TYPE_CHECKING:
+    from envs.registry import StepCost
     from experiments.store.results import Results
 
 MOST_PARTS = 20  # of a task, that are told apart
@@ -109,6 +110,32 @@ def part_shares(returns: np.ndarray, num_parts: np.ndarray) -> list[PartShare] |
     ks = range(1, min(int(num_parts.max()), MOST_PARTS) + 1)
     reached = [done[:, num_parts >= k] >= k for k in ks]
     return [PartShare(float(those.mean()), those.size) for those in reached]
+
+
+class Arrivals(NamedTuple):
+    """How often and how straight single episodes arrived at their goals, over tasks and seeds."""
+
+    success_rate: float
+    """Share of the episodes that arrived."""
+    spl: float
+    """Success weighted by path length (Anderson et al., "On Evaluation of Embodied Navigation Agents",
+    2018): the mean of shortest over walked steps, and 0 for an episode that did not arrive. Every step
+    counts as walked, those against a wall, too."""
+
+
+def arrivals(returns: np.ndarray, optimum: np.ndarray, cost: StepCost) -> Arrivals:
+    """Success rate and SPL.
+
+    Args:
+      returns: [S, N] returns of single episodes.
+      optimum: [N] best returns that can be had.
+      cost: how the world pays them.
+    """
+    steps, shortest = cost.num_steps(returns), cost.num_steps(optimum)
+    arrived = np.isfinite(steps)
+    walked = np.where(arrived, steps, 1.0)
+    straight = np.where(arrived, np.minimum(shortest, walked) / walked, 0.0)
+    return Arrivals(float(arrived.mean()), float(straight.mean()))
 
 
 class Comparison(NamedTuple):

@@ -20,6 +20,7 @@ from experiments.store.statistics import (
     Interval,
     PartShare,
     SeedSpread,
+    arrivals,
     gain_over_tasks,
     mean_log_success,
     part_shares,
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from experiments.store.results import Results
 
 MIDWAY = 40  # episodes after which the regret is also given
+BEHIND_NOISE = 10  # least number of episodes of a judgement behind noise
 SOLVED = 1e-4  # a smaller regret counts as an optimal solution
 CLOSE = 1e-4  # numbers of a summary and of the arrays may differ by this, relative to their size
 ADAPT_AGAIN = "adapt again with `python -m experiments.adapt`"
@@ -42,6 +44,7 @@ DECIDING = {
     "eval_episodes": ArrayField(("C",), "int64", low=1),
     "eval_returns": ArrayField(("S", "N", "C"), "numbers"),
     "eval_achieved": ArrayField(("S", "N", "C", "M"), "numbers", required=False, low=0, high=1),
+    "num_scored": ArrayField(("S", "N", "R"), "integers", required=False, low=0),
     "optimal_returns": ArrayField(("N",), "numbers", required=False),
     "num_parts": ArrayField(("N",), "integers", required=False, low=0),
 }
@@ -97,6 +100,13 @@ class Summary(TypedDict):
     """p_1, p_2, .. of the optimized prompt, each with the number of tasks and seeds that it is of
     (``statistics.part_shares``). None where tasks are not rewarded part by part, and where a judged return
     is the mean of several episodes: only that mean is kept, which does not tell the parts of each."""
+    success_rate: NotRequired[Fraction]
+    """Of worlds whose task is to arrive in few steps (``World.step_cost``): the share of the judged
+    episodes under the optimized prompt that did. It is counted in single episodes, as the next is."""
+    spl: NotRequired[Fraction]
+    """Success weighted by path length (``statistics.Arrivals``)."""
+    prompts_scored: NotRequired[Amount]
+    """Of methods that ask the policy about prompts without spending an episode: how many in a search."""
     failed_episodes: Tally
     best_episode_return: float
     """Return of the best single episode of the search, a matter of luck in worlds of chance."""
@@ -131,8 +141,10 @@ def summarize(
         **_of_judgements(results.eval_returns),
         **_against_optimum(results.eval_episodes, results.eval_returns, optimum, solvable),
         "part_shares": part_shares(final, results.num_parts) if single else None,
+        **of_arrivals(results.eval_returns, optimum, results.world if single else None),
         **_of_sampling(results),
         **_of_named_goals(results),
+        **_of_scoring(results),
         "failed_episodes": num_failed,
         "cpu_seconds": cpu_seconds,
         "episodes_per_cpu_second": num_episodes / cpu_seconds,
@@ -162,12 +174,34 @@ def _of_judgements(eval_returns: np.ndarray) -> dict[str, Any]:
     }
 
 
+def of_arrivals(
+    eval_returns: np.ndarray, optimum: np.ndarray | None, world: World | None
+) -> dict[str, Any]:
+    """The entries ``success_rate`` and ``spl`` of a summary, in worlds that have them; elsewhere nothing.
+
+    Args:
+      eval_returns: [S, N, C] judged returns of single episodes.
+      optimum: [N], if it is known.
+      world: None where the judged returns are means of several episodes.
+    """
+    if world is None or world.step_cost is None or optimum is None:
+        return {}
+    return arrivals(eval_returns[:, :, -1], optimum, world.step_cost)._asdict()
+
+
+def _of_scoring(results: Results) -> dict[str, Any]:
+    """The entry ``prompts_scored`` of a summary, of methods that score prompts without an episode."""
+    if results.num_scored is None:
+        return {}
+    return {"prompts_scored": float(results.num_scored[:, :, -1].mean())}
+
+
 def _of_sampling(results: Results) -> dict[str, Any]:
     """The entry ``fresh`` of a summary, in worlds that judge by sampled actions; elsewhere nothing."""
     judged = results.world.judged
     if judged.mode != "sample":
         return {}
-    episodes = results.config.get("eval_episodes") or judged.episodes
+    episodes = judged_episodes(results.config, results.world)
     return {"fresh": {"episodes": episodes, **_gain(results.eval_returns)}}
 
 
@@ -192,10 +226,20 @@ def _first_and_last(achieved: np.ndarray) -> np.ndarray:
 
 def judged_once(config: Mapping[str, Any], world: World | None) -> bool | None:
     """Whether a judged return is of a single episode; None if only the world knows, which is not known."""
-    episodes = config.get("eval_episodes")
-    if episodes is None:
-        return None if world is None else world.judged.episodes == 1
-    return episodes == 1
+    episodes = judged_episodes(config, world)
+    return None if episodes is None else episodes == 1
+
+
+def judged_episodes(config: Mapping[str, Any], world: World | None) -> int | None:
+    """How many episodes a judged return is the mean of; None if only the world knows, which is not known.
+
+    The settings or the world's record say it. Behind noise it is at least ``BEHIND_NOISE``: the record does
+    not know of that noise.
+    """
+    if (episodes := config.get("eval_episodes")) is not None or world is None:
+        return episodes
+    noisy = config.get("obs_noise") or config.get("action_noise")
+    return max(world.judged.episodes, BEHIND_NOISE if noisy else 1)
 
 
 def solvable_tasks(results: Results) -> np.ndarray:
@@ -268,7 +312,9 @@ def _check_name(registry: Registry, name: str, path: Path) -> None:
         raise DataError(f"{path}: {error}; {ADAPT_AGAIN}") from None
 
 
-def check_against(path: Path, summary: Summary, single: bool | None) -> None:
+def check_against(
+    path: Path, summary: Summary, single: bool | None, world: World | None = None
+) -> None:
     """Raise ``DataError`` if a summary does not follow from the returns in ``results.npz``.
 
     Only their world knows which tasks nobody can solve. The summary says how many there are, and its share
@@ -279,8 +325,9 @@ def check_against(path: Path, summary: Summary, single: bool | None) -> None:
       summary: what is to follow from it.
       single: whether the judged returns are of single episodes (``judged_once``). Where that is not known,
         the summary may leave out its p_k.
+      world: whose summary it is, where that is known.
     """
-    arrays = read_arrays(path, DECIDING, dict.fromkeys("SNEC", range(1, 2**31)), ADAPT_AGAIN)
+    arrays = read_arrays(path, DECIDING, dict.fromkeys("SNECR", range(1, 2**31)), ADAPT_AGAIN)
     judged, optimum = arrays["eval_returns"], arrays.get("optimal_returns")
     found: dict[str, Any] = {"unsolvable_tasks": 0, **summary}
     num_tasks = judged.shape[1]
@@ -300,6 +347,13 @@ def check_against(path: Path, summary: Summary, single: bool | None) -> None:
         known = "num_parts" in arrays and single is not False
         shares = part_shares(judged[:, :, -1], arrays["num_parts"]) if known else None
         expected["part_shares"] = None if single is None and not found["part_shares"] else shares
+    if "spl" in summary and world is not None:
+        expected |= {"success_rate": None, "spl": None}
+        expected |= of_arrivals(judged, optimum, world if single else None)
+    if "prompts_scored" in summary or "num_scored" in arrays:
+        scored = arrays.get("num_scored")
+        found.setdefault("prompts_scored", None)
+        expected["prompts_scored"] = None if scored is None else scored[:, :, -1].mean()
     if fresh := summary.get("fresh"):
         found |= fresh
         expected |= _gain(judged)
@@ -389,6 +443,8 @@ def printed(summary: Mapping[str, Any]) -> str:
             ("  after 40", "-" if after_40 is None else f"{after_40:.3f}"),
             ("solved optimally", f"{100 * summary['solved_optimally']:.0f} %"),
         ]
+    if (spl := summary.get("spl")) is not None:
+        rows.append(("success rate, SPL", f"{_percent(summary['success_rate'])}, {spl:.3f}"))
     if shares := summary.get("part_shares"):
         rows.append(("parts in order", "share with the first k done (tasks x seeds that have k)"))
         rows += [(f"  p{k}", str(PartShare(*pair))) for k, pair in enumerate(shares, 1)]
@@ -399,6 +455,12 @@ def printed(summary: Mapping[str, Any]) -> str:
                 "unsolvable tasks",
                 f"{unsolvable} of {summary['num_tasks']} (never within the horizon)",
             )
+        )
+    if scored := summary.get("prompts_scored"):
+        num = summary["num_tasks"] * summary["num_seeds"]
+        each = summary["cpu_seconds"] / num
+        rows.append(
+            ("a search", f"{scored:.0f} prompts scored by the policy, {each:.2f} CPU-seconds")
         )
     if failed:
         rows.append(("failed episodes", f"{failed} (the world broke down)"))

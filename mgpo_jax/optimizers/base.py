@@ -29,6 +29,9 @@ class PromptOptimizer(NamedTuple):
     """``(state, query, episode) -> state``."""
     best: Callable[[Any], Prompt]
     """``(state) -> prompt``: the best prompt so far."""
+    num_scored: Callable[[Any], Int[Array, ""]] | None = None
+    """``(state) -> number`` of prompts that it scored so far by asking the policy, without an episode; None
+    for those that learn by episodes alone."""
 
 
 @dataclass(frozen=True, kw_only=True)

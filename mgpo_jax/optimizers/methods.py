@@ -60,7 +60,14 @@ def prompt_adapter(
     def best(state: Any) -> Query:
         return judged_query(optimizer.best(state), judged)
 
-    return Adapter(init=optimizer.init, ask=ask, agent=agent, tell=tell, best=best)
+    return Adapter(
+        init=optimizer.init,
+        ask=ask,
+        agent=agent,
+        tell=tell,
+        best=best,
+        num_scored=optimizer.num_scored,
+    )
 
 
 def judged_query(prompt: Prompt, judged: Judgement) -> Query:

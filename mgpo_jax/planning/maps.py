@@ -140,7 +140,7 @@ def plan_map(
         first = single_goal(state.task_goal, space.num_slots)
         return choose(state.prompts.size == 0, first, state.prompts.prompt(index))
 
-    return PromptOptimizer(init, ask, tell, best)
+    return PromptOptimizer(init, ask, tell, best, lambda state: state.num_rehearsed)
 
 
 def _next_query(tools: Tools, key: PRNGKeyArray, state: MapState) -> tuple[Query, MapState]:

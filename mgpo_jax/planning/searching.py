@@ -189,11 +189,12 @@ def search_prompts(
     num_rounds, pool = jax.lax.while_loop(goes_on, change, (jnp.int32(0), pool))
     num, led = NUM_PROMPTS * (1 + num_rounds), memory.led
     if tools.features.steering and tools.policy.score is not None:
-        room = jnp.array(LENGTHS_LED)
+        lengths = sorted({min(length, space.horizon) for length in LENGTHS_LED})
+        room = jnp.array(lengths)
         needed = ~_has_shortest(pool, way.steps) & (way.steps <= room[-1])
         branches: list[Callable[[Pool], tuple[Pool, Prompt]]] = [
             lambda pool: (pool, led),
-            *(partial(_steered, key_led, quest, fresh, led, longest) for longest in LENGTHS_LED),
+            *(partial(_steered, key_led, quest, fresh, led, longest) for longest in lengths),
         ]
         which = jnp.where(needed, 1 + jnp.sum(way.steps > room), 0)
         pool, led = jax.lax.switch(which, branches, pool)

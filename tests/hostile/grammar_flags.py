@@ -102,6 +102,7 @@ CONTRADICTIONS: dict[str, tuple[tuple[str, str], ...]] = {
         ("--method mgpo_jax.methods:NOTHING", "NOTHING"),
         ("--method envs.maze:MAZE15", "MAZE15"),
         ("--env gridworld", "policy"),
+        ("--action-noise 1.5", "--action-noise"),
     ),
     "evaluate": (
         ("--env gridworld", "gridworld"),
@@ -172,6 +173,7 @@ VALID: dict[str, tuple[str, ...]] = {
         "--env envs.maze:MAZE15",
         "--seed 4294967295",
         "--figures",
+        "--obs-noise 0.02 --action-noise 0.1",
     ),
     "evaluate": ("--obs-noise 0 --action-noise 0.5", "--episodes 1", "--env maze15"),
     "check": ("--env maze15",),
