@@ -103,6 +103,7 @@ class World:
         method, such as the unit of returns in which a bandit counts.
       step_cost: how episodes are paid where the task is to arrive in as few steps as possible; tables then
         have a success rate and SPL [None: it is another task].
+      extra: the extra of this package that it needs [none].
       num_test_tasks: how many tasks are kept for test.
       official: the program by others that this world re-implements, to compare it with [none].
     """
@@ -118,6 +119,7 @@ class World:
     judged: Judgement = field(default_factory=Judgement)
     method_defaults: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     step_cost: StepCost | None = None
+    extra: str | None = None
     num_test_tasks: int = 50
     official: Callable[[Any], Official] | None = None
 

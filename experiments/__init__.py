@@ -26,8 +26,9 @@ def _leave_quietly() -> None:
 
     A KeyboardInterrupt in the middle of an import can be swallowed, or leave the interpreter crashing.
     """
-    started = Path(sys.argv[0]).name if sys.argv else ""
-    as_command = started in ("-m", "mgpo")  # argv[0] is "-m" until ``python -m`` finds the module
+    started = Path(sys.argv[0]) if sys.argv else Path()
+    # argv[0] is "-m" until ``python -m`` finds the module.
+    as_command = started.name in ("-m", "mgpo") or started.parts[-2:] == ("mgpo_jax", "__main__.py")
     ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     if as_command and not ignored and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, lambda number, frame: os._exit(128 + number))

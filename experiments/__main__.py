@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import importlib
 import sys
+from importlib.metadata import version
 
 from envs.errors import nearest
 
 COMMANDS = {
-    "list": "the worlds and methods there are",
+    "list": "the worlds, methods and networks there are, and what each needs",
+    "info": "what is installed, on which devices",
     "collect": "collect a dataset of demonstrations",
     "pretrain": "pre-train a policy",
     "adapt": "adapt a policy to unseen tasks",
@@ -31,6 +33,9 @@ def main() -> None:
     if not words or words[0] in ("-h", "--help"):
         print("usage: mgpo COMMAND [FLAGS]; `mgpo COMMAND --help` shows the flags\n")
         print("\n".join(f"  {name:<10} {text}" for name, text in COMMANDS.items()))
+        sys.exit(0)
+    if words[0] == "--version":
+        print(f"mgpo {version('mgpo-jax')}")
         sys.exit(0)
     if words[0] not in COMMANDS:
         print(f"error: {nearest(words[0], COMMANDS, 'command')}", file=sys.stderr)

@@ -2,25 +2,70 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
 from envs.errors import UsageError
-from envs.registry import WORLDS, Registry
+from envs.registry import WORLDS, Registry, World
+from experiments.installed import extras, released_networks
 from experiments.runtime import Common, run, say
-from mgpo_jax.kinds import KINDS
-from mgpo_jax.methods import METHODS
+from mgpo_jax.kinds import KINDS, MULTI_GOAL
+from mgpo_jax.methods import METHODS, Method
 
 
 @dataclass(frozen=True)
 class ListConfig(Common):
     """Settings of ``experiments.list``."""
 
+    json: bool = False
+    """Print JSON."""
+
+
+def needs_of(record: Any) -> str:
+    """What a world, method or network needs, in a line; empty for nothing but what is always there."""
+    if isinstance(record, World):
+        networks = ", ".join(map(str, released_networks(record))) or "none"
+        return f"released networks: {networks}{_extra_of(record)}"
+    if isinstance(record, Method) and record.policy != MULTI_GOAL:
+        return f"starts from the network {record.policy}"
+    return ""
+
+
+def _extra_of(world: World) -> str:
+    if world.extra is None:
+        return ""
+    missing = [extra for extra in extras() if extra.name == world.extra and extra.missing]
+    return f"; {missing[0]}" if missing else f"; extra {world.extra}"
+
+
+def gathered() -> dict[str, Any]:
+    """Worlds, methods and networks with what each needs, as JSON values."""
+    return {
+        "worlds": [
+            {
+                "name": world.name,
+                "summary": world.summary,
+                "extra": world.extra,
+                "networks": {kind: size for kind, size in released_networks(world)},
+                "test_tasks": world.num_test_tasks,
+            }
+            for world in WORLDS.usable()
+        ],
+        "methods": [
+            {"name": method.name, "summary": method.summary, "network": method.policy}
+            for method in METHODS.usable()
+        ],
+        "networks": [{"name": kind.name, "summary": kind.summary} for kind in KINDS.usable()],
+    }
+
 
 def main(config: ListConfig) -> None:
-    """List the worlds, methods and networks that are known by name."""
-    del config
+    """List the worlds, methods and networks that are known by name, and what each needs."""
+    if config.json:
+        say(json.dumps(gathered(), indent=2))
+        return
     registries: dict[str, Registry[Any]] = {
         "worlds (--env)": WORLDS,
         "methods (adapt --method)": METHODS,
@@ -30,10 +75,13 @@ def main(config: ListConfig) -> None:
         say(title)
         for name in registry.names():
             try:
-                summary = registry.find(name).summary
+                record = registry.find(name)
+                summary, needs = record.summary, needs_of(record)
             except UsageError as error:  # of a package that is installed beside this one
-                summary = str(error)
+                summary, needs = str(error), ""
             say(f"  {name:<18} {summary}")
+            if needs:
+                say(f"  {'':<18} {needs}")
         say("")
     say("Others are given as module:attribute, such as --env my_package.my_world:WORLD.")
 

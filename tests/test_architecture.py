@@ -26,6 +26,7 @@ WORLD_FOLDERS = sorted(
 # Where a world may be named: the default of --env.
 MAY_NAME = {"experiments.store.settings": {"maze15"}}
 DEVICES = {"device_get", "device_put", "addressable_shards", "shard_map", "NamedSharding"}
+STARTS_COMMANDS = "mgpo_jax.__main__"  # ``python -m mgpo_jax`` is the console script
 MAY_MOVE = "mgpo_jax.sharding"
 LONG, MAX_LONG = 60, 3  # lines of a long function, and how many of them there may be
 COMMAND_LINES = 150
@@ -165,6 +166,8 @@ def is_within(name: str, package: str) -> bool:
 
 def wrong_imports(tree: ast.Module, module: str, is_package: bool = False) -> Iterator[str]:
     """Imports of a higher floor, and of a world by generic code, wherever they stand."""
+    if module == STARTS_COMMANDS:
+        return
     floor = module.split(".")[0]
     above = FLOORS[FLOORS.index(floor) + 1 :]
     worlds = [f"envs.{folder}" for folder in WORLD_FOLDERS] if floor in GENERIC else []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -236,6 +237,7 @@ def test_the_console_script_runs_its_commands(
         (["adapt", "--env", "maze51"], 2, "did you mean 'maze15'?"),
         (["evaluate"], 2, "no result folder given"),
         (["list"], 0, ""),
+        (["--version"], 0, ""),
     ):
         monkeypatch.setattr(sys, "argv", ["mgpo", *words])
         with pytest.raises(SystemExit) as stop:
@@ -248,7 +250,7 @@ def test_the_console_script_runs_its_commands(
 def test_list_names_worlds_and_methods(tmp_path: Path) -> None:
     done = run_python("-m experiments.list", tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
-    first = {line.split()[0]: line for line in done.stdout.splitlines() if line.startswith("  ")}
+    first = {row.split()[0]: row for row in done.stdout.splitlines() if re.match(r"  \S", row)}
     assert set(first) == {*envs.names(), *methods.names(), *KINDS.names()}
     assert envs.find("maze15").summary in first["maze15"]
     assert methods.find("bbt").summary in first["bbt"]

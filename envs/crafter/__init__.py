@@ -103,6 +103,7 @@ CRAFTER_SYMBOLIC = World(
     name="crafter-symbolic",
     make=make,
     summary="22 achievements in a generated world, seen as the codes of what is in view",
+    extra="crafter",
     demonstrators=load_demonstrators,
     presets={name: {**preset, "encoder": "cells"} for name, preset in PRESETS.items()},
     pictures=load_pictures,

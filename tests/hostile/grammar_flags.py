@@ -38,6 +38,7 @@ OUTPUTS = {"out", "json"}
 
 BASE: dict[str, tuple[str, tuple[str, ...]]] = {
     "list": ("", ()),
+    "info": ("", ()),
     "collect": ("--env gridworld --trajectories 4 --out new", ()),
     "pretrain": (
         "--preset smoke --trajectories 40 --holdout 8 --embed-dim 8 --num-layers 1 --batch-size 8 "
@@ -148,6 +149,7 @@ CONTRADICTIONS: dict[str, tuple[tuple[str, str], ...]] = {
     "release": (("policy", "policy"), ("nowhere", "nowhere")),
     "bench": (("--demonstrator nobody", "demonstrator"),),
     "list": (("maze15", "maze15"),),
+    "info": (("maze15", "maze15"),),
 }
 """Words that contradict each other or the sound input, and what the refusal has to name."""
 
