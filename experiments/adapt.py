@@ -44,7 +44,11 @@ def main(config: AdaptConfig) -> None:
     if config.validation_seed and not config.validation:
         raise UsageError("--validation-seed says which validation tasks to draw; add --validation")
     folder = config.folder
-    if not (config.resume and os.path.isdir(folder)):
+    if config.sweep:
+        from experiments.sweeping import show, sweep_and_save, variants
+
+        variants(config)
+    if config.sweep or not (config.resume and os.path.isdir(folder)):
         refuse_existing(folder, "remove it", "choose another with --out")
     world = envs.find(config.env)
     from envs.wrappers import behind_noise
@@ -55,6 +59,10 @@ def main(config: AdaptConfig) -> None:
     env = behind_noise(envs.make(config.env), config.obs_noise, config.action_noise)
     policy = load_policy(world, config.policy, methods.find(config.method).policy)
     tasks = chosen_tasks(world, env, config.tasks, config.validation, config.validation_seed)
+    if config.sweep:
+        show(config, sweep_and_save(config, world, env, policy, tasks))
+        print(f"results in {folder}", file=sys.stderr)
+        return
     if folder.is_dir():
         results = finished(folder, config, policy, tasks)
         print(f"{folder} is finished already", file=sys.stderr)

@@ -73,7 +73,7 @@ def adapt_all(
     )
 
 
-NOT_DECIDING = ("debug", "figures", "out", "policy", "resume", "tasks")
+NOT_DECIDING = ("debug", "figures", "out", "policy", "resume", "sweep", "tasks")
 """Settings of the command that do not decide about its results, or whose content is hashed instead."""
 
 

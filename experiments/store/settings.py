@@ -447,6 +447,9 @@ class AdaptConfig(Common):
     """Standard deviation of noise on observations, in their units: search and evaluations run behind it."""
     action_noise: NotNegative = 0.0
     """That of noise on actions; where they are discrete, the probability of a random one."""
+    sweep: tuple[str, ...] = ()
+    """Numbers among the method's hyper-parameters with several values each, such as ``c=0.1,1,10``: all of
+    them, crossed, are one program and one table."""
     keep_actions: bool = False
     """Also keep continuous actions in the results; discrete ones are always kept."""
     out: Path | None = None
@@ -463,6 +466,7 @@ class AdaptConfig(Common):
         name = f"{file_name(self.method)}-seed{self.seed}"
         name += f"-obs{self.obs_noise:g}" if self.obs_noise else ""
         name += f"-action{self.action_noise:g}" if self.action_noise else ""
+        name += "-sweep" if self.sweep else ""
         return self.out or RUNS / "adapt" / file_name(self.env) / name
 
 

@@ -1,0 +1,115 @@
+"""``adapt --sweep c=0.1,1,10``: hyper-parameters with several values each, all in one compiled program."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from envs.base import Environment, Task
+from envs.errors import UsageError, nearest, shown
+from envs.registry import World
+from experiments.adaptation import adapt_all, deciding, results_with_summary
+from experiments.runtime import expect_compiling, say
+from experiments.store.provenance import provenance
+from experiments.store.results import write_results
+from experiments.store.settings import AdaptConfig
+from experiments.store.work import long_work
+from mgpo_jax import methods
+from mgpo_jax.methods import foreign_setting, split_hyper
+from mgpo_jax.policy import LoadedPolicy
+from mgpo_jax.settings import check_settings, check_values, get_parts, types_of
+
+
+def variants(config: AdaptConfig) -> dict[str, AdaptConfig]:
+    """The settings of each variant by its name, such as ``c=0.1``; several swept settings are crossed.
+
+    Raises:
+      UsageError: for what is no sweep of numbers that one program can take.
+    """
+    swept = dict(_values(text, config) for text in config.sweep)
+    if len(swept) < len(config.sweep):
+        raise UsageError("--sweep names a setting twice; give all of its values at once")
+    found: dict[str, AdaptConfig] = {}
+    for values in itertools.product(*swept.values()):
+        named = dict(zip(swept, values, strict=True))
+        name = ",".join(f"{key}={value:g}" for key, value in named.items())
+        if name in found:
+            raise UsageError(f"--sweep has {name} twice; leave one of them out")
+        hyper = dataclasses.replace(config.hyper, **named)
+        check_settings(hyper)
+        found[name] = dataclasses.replace(config, hyper=hyper, sweep=(), out=config.folder / name)
+    try:
+        split_hyper([variant.hyper for variant in found.values()])
+    except UsageError as error:
+        raise UsageError(f"--sweep: {error}; run adapt once for each value") from None
+    return found
+
+
+def _values(text: str, config: AdaptConfig) -> tuple[str, list[int | float]]:
+    """A hyper-parameter and its values from text such as ``c=0.1,1,10``."""
+    name, sign, listed = text.partition("=")
+    name = name.replace("-", "_")
+    if not (name and sign and listed):
+        raise UsageError(f"--sweep needs words such as c=0.1,1,10, found {shown(text)}")
+    own = {field.name: field for field in dataclasses.fields(config.hyper)}
+    if name not in own:
+        method = methods.find(config.method)
+        if not own:
+            raise foreign_setting(name, method)
+        raise nearest(name, list(own), f"hyper-parameter of {method.name}")
+    kind = int if int in get_parts(types_of(type(config.hyper))[name]) else float
+    values: list[int | float] = []
+    for word in listed.split(","):
+        value: Any = word  # what is no number is refused by the check
+        with suppress(ValueError):
+            value = kind(word)
+        try:
+            check_values(type(config.hyper), {name: value})
+        except UsageError as error:
+            raise UsageError(f"--sweep {shown(text)}: {error}") from None
+        values.append(value)
+    return name, values
+
+
+def show(config: AdaptConfig, folders: Sequence[Path]) -> None:
+    """Print the table of the variants, and draw their learning curves together."""
+    from experiments.drawing import write
+    from experiments.figures import later, learning_curve
+    from experiments.store.results import load_results
+    from experiments.store.rows import comparison, read_row
+
+    say(comparison([read_row(folder) for folder in folders]))
+    if config.figures:
+        curves = {f"{config.method} ({f.name})": load_results(f, parts=()) for f in folders}
+        write(config.folder / "learning_curve.png", later(learning_curve, curves, config.env))
+
+
+def sweep_and_save(
+    config: AdaptConfig, world: World, env: Environment, policy: LoadedPolicy, tasks: Task
+) -> list[Path]:
+    """Adapt with every variant, and write the results of each to a folder below ``config.folder``.
+
+    Returns:
+      The folders, in the order of the variants.
+
+    Raises:
+      UsageError: for a sweep that is none, or unfinished work that ``--resume`` does not ask for.
+      DataError: if the folder exists, another process makes it, or a return is not finite.
+    """
+    named = variants(config)
+    settings = {name: deciding(variant, policy, tasks) for name, variant in named.items()}
+    with long_work(config.folder, settings, provenance(), config.resume) as work:
+        expect_compiling()
+        outcomes = adapt_all(world, env, policy, tasks, list(named.values()), work.journal)
+        for (name, variant), outcome in zip(named.items(), outcomes, strict=True):
+            place = work.place / name
+            place.mkdir()
+            results = results_with_summary(variant, env, policy, tasks, outcome)
+            write_results(
+                place, results, config.folder / name, {**work.meta, "settings": settings[name]}
+            )
+    return [config.folder / name for name in named]
