@@ -69,19 +69,22 @@ def adapt_all(
         eval_every=first.eval_every,
         judged=judged,
         keep_actions=first.keep_actions,
+        stop_at=first.stop_at,
         journal=journal,
     )
 
 
 NOT_DECIDING = ("debug", "figures", "out", "policy", "resume", "sweep", "tasks")
 """Settings of the command that do not decide about its results, or whose content is hashed instead."""
+ADDED = ("obs_noise", "action_noise", "stop_at")
+"""Settings that count where they are given: work that was begun before there were these goes on."""
 
 
 def deciding(config: AdaptConfig, policy: LoadedPolicy, tasks: Task) -> dict[str, Any]:
     """Everything that decides about the results of an adaptation, as JSON values."""
     settings = {k: v for k, v in to_json(config).items() if k not in NOT_DECIDING}
-    for name in ("obs_noise", "action_noise"):  # work that was begun before there was noise goes on
-        if not settings[name]:
+    for name in ADDED:
+        if settings[name] == getattr(AdaptConfig, name):
             del settings[name]
     hashes = {"policy_sha256": policy.sha256, "tasks_sha256": hash_arrays(task_arrays(tasks))}
     return {**settings, **hashes}
@@ -145,6 +148,17 @@ def save_outcome(
         write_results(place, results, folder, meta)
 
 
+def _idle(results: Results) -> int:
+    """How many episodes of a search and its judgements were not run since the search had ended."""
+    used = results.episodes_used
+    if used is None:
+        return 0
+    judged = judged_episodes(results.config, results.world)
+    assert judged is not None
+    later = (results.eval_episodes > used[..., None]).sum()
+    return int((results.returns.shape[-1] - used).sum() + judged * later)
+
+
 def results_with_summary(
     config: AdaptConfig, env: Environment, policy: LoadedPolicy, tasks: Task, outcome: Outcome
 ) -> Results:
@@ -154,7 +168,7 @@ def results_with_summary(
     summary = summarize(
         results,
         policy_sha256=policy.sha256,
-        num_episodes=outcome.num_episodes,
+        num_episodes=outcome.num_episodes - _idle(results),
         num_failed=outcome.num_failed,
         cpu_seconds=outcome.cpu_seconds,
     )

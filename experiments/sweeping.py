@@ -61,7 +61,8 @@ def _values(text: str, config: AdaptConfig) -> tuple[str, list[int | float]]:
         if not own:
             raise foreign_setting(name, method)
         raise nearest(name, list(own), f"hyper-parameter of {method.name}")
-    kind = int if int in get_parts(types_of(type(config.hyper))[name]) else float
+    settings_class: Any = type(config.hyper)
+    kind = int if int in get_parts(types_of(settings_class)[name]) else float
     values: list[int | float] = []
     for word in listed.split(","):
         value: Any = word  # what is no number is refused by the check

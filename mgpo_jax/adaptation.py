@@ -160,6 +160,7 @@ def proceed(
     judge_key: PRNGKeyArray | None = None,
     num_judged: int = 0,
     keep_actions: bool = False,
+    stopped: Bool[Array, ""] | None = None,
 ) -> tuple[AdaptState, AdaptLog, Judged]:
     """The next rounds of a search, and then episodes that judge its best choice.
 
@@ -175,6 +176,8 @@ def proceed(
       judge_key: random key of the judging episodes (default: none are run).
       num_judged: number of the judging episodes (static).
       keep_actions: whether the log also keeps continuous actions.
+      stopped: whether the search has ended before: then episodes have no steps and nothing changes
+        (default: it has not, which costs no test).
     """
     judge_keys = None if judge_key is None else jax.random.split(judge_key, num_judged)
 
@@ -182,7 +185,7 @@ def proceed(
     def entry(state: AdaptState, index: Array) -> tuple[AdaptState, AdaptLog]:
         searching = jnp.ones((), bool) if judge_keys is None else index < num_rounds
         own_key = None if judge_keys is None else judge_keys[jnp.maximum(index - num_rounds, 0)]
-        return _round(state, env, adapter, task, searching, own_key, keep_actions)
+        return _round(state, env, adapter, task, searching, own_key, keep_actions, stopped)
 
     shapes = jax.eval_shape(entry, state, jnp.int32(0))[1]
     size = max_rounds + num_judged
@@ -211,6 +214,7 @@ def _round(
     searching: Bool[Array, ""],
     judge_key: PRNGKeyArray | None,
     keep_actions: bool,
+    stopped: Bool[Array, ""] | None,
 ) -> tuple[AdaptState, AdaptLog]:
     """One round of the search, or (not ``searching``) one judging episode, which changes nothing."""
     key, key_ask, key_run, key_tell = jax.random.split(state.key, 4)
@@ -224,7 +228,11 @@ def _round(
         # The same judging episodes for every method, however many episodes its rounds have.
         judge_keys = jnp.broadcast_to(judge_key, keys.shape)
         key, keys = choose(searching, (key, keys), (state.key, judge_keys))
+    if stopped is not None:
+        choice = choose(stopped, adapter.best(state.search), choice)
     agent = adapter.agent(asked, choice)
+    if stopped is not None:
+        agent = idle_when(stopped, agent)
     wanted = jnp.where(searching, num, 1)
     episodes = _episodes(keys, env, agent, task, wanted)
 
@@ -233,6 +241,8 @@ def _round(
         return tell(key_tell, asked, choice, episodes)
 
     after = told() if judge_key is None else jax.lax.cond(searching, told, lambda: state.search)
+    if stopped is not None:
+        after = choose(stopped, state.search, after)
     kept = env.spec.discrete or keep_actions
     log = AdaptLog(
         returns=episodes.return_,
@@ -247,6 +257,16 @@ def _round(
         num_scored=None if adapter.num_scored is None else adapter.num_scored(after),
     )
     return AdaptState(key, after), log
+
+
+def idle_when(stopped: Bool[Array, ""], agent: Agent) -> Agent:
+    """The agent, which quits before its first step where its search has ended."""
+
+    def begin(key: PRNGKeyArray, task: Task, state: Any, timestep: Any) -> tuple[Any, Any, Any]:
+        action, quits, memory = agent.begin(key, task, state, timestep)
+        return action, quits | stopped, memory
+
+    return agent._replace(begin=begin)
 
 
 def in_turn(function: Callable) -> Callable:

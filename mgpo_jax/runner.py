@@ -41,6 +41,7 @@ from mgpo_jax.policy import LoadedPolicy, check_fits, transformer_policy
 from mgpo_jax.progress import Progress
 from mgpo_jax.rollout import Query, rollout
 from mgpo_jax.sharding import device_mesh, fetch, is_key, on_devices, replicate, split
+from mgpo_jax.stopping import ended, filled
 from mgpo_jax.tasks import num_tasks
 from mgpo_jax.transformer import GoalTransformer, TransformerConfig
 from mgpo_jax.trees import numbered_leaves, with_leaves
@@ -175,6 +176,7 @@ def sweep(
     eval_every: int = 10,
     judged: Judgement | None = None,
     keep_actions: bool = False,
+    stop_at: float | None = None,
     journal: Journal | None = None,
 ) -> list[Outcome]:
     """One outcome for each variant of a method's hyper-parameters, all from one program.
@@ -192,6 +194,8 @@ def sweep(
       eval_every: episodes between judgements of the best choice.
       judged: how the best choice is judged (default: one greedy episode).
       keep_actions: whether to keep continuous actions; discrete ones are always kept.
+      stop_at: a search ends when its best choice is judged at this return or more (``stopping``); the
+        episodes that it did not need have the best return that it had seen, and no steps.
       journal: where finished segments are kept; those that it holds are not run again.
 
     Raises:
@@ -211,11 +215,15 @@ def sweep(
     _check_room(env, grid, episodes)
     layout = _lay_out(env, grid.size, _memory_bytes(env, adapter, tasks))
     program = _program(method, setting, fixed, layout, max(segments), keep_actions)
-    lanes = split(layout.mesh, grid.lanes(layout, tasks, seed, numbers))
+    own = grid.lanes(layout, tasks, seed, numbers)
+    if stop_at is not None:
+        own = own._replace(stopped=jnp.zeros(layout.num_lanes, bool))
+    lanes = split(layout.mesh, own)
     params = replicate(layout.mesh, policy.params)
     per_round = adapter.episodes_per_round * grid.size
     journal = journal or Journal()
-    record, cpu = _run(program, lanes, params, segments, grid, layout, per_round, journal)
+    run = Run(program, lanes, params, segments, grid, layout, per_round, stop_at)
+    record, cpu = _run(run, journal)
     # The search, too, begins with one evaluation of the initial choice.
     after = np.concatenate([[1], np.cumsum(segments) * adapter.episodes_per_round])
     per_lane = episodes + (len(segments) + 1) * setting.judged.episodes
@@ -264,6 +272,8 @@ class Lanes(NamedTuple):
     key: PRNGKeyArray
     numbers: dict[str, Array]
     """Hyper-parameters that are data."""
+    stopped: Bool[Array, "*lanes"] | None = None
+    """Whether the search has ended; None where none ends early."""
 
 
 class Layout(NamedTuple):
@@ -401,6 +411,7 @@ def _program(
             judge_key=jax.random.fold_in(lane.key, number),
             num_judged=setting.judged.episodes,
             keep_actions=keep_actions,
+            stopped=lane.stopped,
         )
 
     return Programs(
@@ -463,21 +474,32 @@ class Segment(NamedTuple):
     cpu_seconds: float
 
 
-def _run(
-    programs: Programs,
-    lanes: Lanes,
-    params: Any,
-    segments: Sequence[int],
-    grid: Grid,
-    layout: Layout,
-    per_round: int,
-    journal: Journal,
-) -> tuple[Record, float]:
-    """Run all segments of an adaptation, each followed by a judgement; the first judgement comes before.
+class Run(NamedTuple):
+    """What an adaptation is made of."""
 
-    ``per_round`` is the number of episodes that all lanes together run in a round. Segments that the
-    journal holds are not run again. The second result is the CPU time, without compilation.
+    programs: Programs
+    lanes: Lanes
+    params: Any
+    segments: Sequence[int]
+    """Rounds between judgements; the first judgement comes before all of them."""
+    grid: Grid
+    layout: Layout
+    per_round: int
+    """Episodes that all lanes together run in a round."""
+    stop_at: float | None
+
+    def without(self, stopped: np.ndarray) -> Lanes:
+        """The lanes, of which some have ended; those beyond the grid repeat the first ones."""
+        index = np.arange(self.layout.num_lanes) % self.grid.size
+        return self.lanes._replace(stopped=split(self.layout.mesh, jnp.asarray(stopped[index])))
+
+
+def _run(run: Run, journal: Journal) -> tuple[Record, float]:
+    """Run all segments of an adaptation, each followed by a judgement.
+
+    Segments that the journal holds are not run again. Also returns the CPU time, without compilation.
     """
+    programs, lanes, params, segments, grid, layout, per_round, stop_at = run
     state = programs.start.compile(lanes, params)(lanes, params)
     # A method whose first state holds NaN means something by it.
     watched = bool(_learns(state.search)) and not fetch(_broken(state.search)).any()
@@ -492,6 +514,10 @@ def _run(
     with Progress(sum(rounds) * per_round, "episode", before * per_round) as progress:
         for number in range(len(done), len(rounds)):
             num = rounds[number]
+            stopped = np.zeros(grid.size, bool)
+            if stop_at is not None and done:
+                stopped = ended([segment.judged for segment in done], stop_at)
+                lanes = run.without(stopped)
             cpu = time.process_time()
             shared = (params, jnp.int32(num), jnp.int32(number))
             state, log, judged = advance((state, lanes), shared)
@@ -499,6 +525,8 @@ def _run(
             cpu = time.process_time() - cpu
             log = jax.tree.map(lambda rows, n=num: rows[: grid.size, :n], log)
             judged = jax.tree.map(lambda rows: rows[: grid.size], judged)
+            if stopped.any():
+                log, judged = filled(log, judged, stopped, [(s.log, s.judged) for s in done])
             _check_finite(log, judged, grid, before)
             if watched:
                 _check_sound(state.search, grid, before + num)

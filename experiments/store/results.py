@@ -47,7 +47,7 @@ from mgpo_jax.schema import (
     read_arrays,
     read_document,
 )
-from mgpo_jax.settings import Count, NotNegative, NumEpisodes, NumSeeds, Seed
+from mgpo_jax.settings import Count, Finite, NotNegative, NumEpisodes, NumSeeds, Seed
 from mgpo_jax.tasks import save_tasks, task_arrays, task_at, tasks_from
 from mgpo_jax.trees import named_leaves
 
@@ -191,6 +191,19 @@ class Results:
     def task(self, index: int) -> Task:
         """One task, with numpy leaves."""
         return jax.tree.map(np.asarray, task_at(self.task_set, index))
+
+    @property
+    def episodes_used(self) -> np.ndarray | None:
+        """[S, N] episodes of each search until it ended; None for searches without ``--stop-at``.
+
+        A search ends after the first judgement that is good enough, or with its budget.
+        """
+        stop_at = self.config.get("stop_at")
+        if stop_at is None:
+            return None
+        enough = self.eval_returns >= stop_at
+        last = np.where(enough.any(axis=-1), enough.argmax(axis=-1), enough.shape[-1] - 1)
+        return self.eval_episodes[last]
 
     def best_goals(self, seed: int, task: int, episodes: int | None = None) -> np.ndarray | None:
         """The goals [k, G] of the best prompt after some episodes (default: all of them).
@@ -358,6 +371,7 @@ class Config(BaseModel):
     eval_episodes: Count | None = None
     obs_noise: NotNegative = 0.0
     action_noise: NotNegative = 0.0
+    stop_at: Finite | None = None
     max_goals: Count | None = None
     keep_rewarded: bool = True
     keep_actions: bool = False

@@ -50,6 +50,7 @@ SHOWN = (
     "eval_episodes",
     "obs_noise",
     "action_noise",
+    "stop_at",
 )  # settings that every method has
 STATED = {"seed", "eval_every"}  # may differ beside the paper's number, since the row states it
 
@@ -207,6 +208,7 @@ HEAD = (
 
 
 FURTHER: Mapping[str, tuple[str, Callable[[Summary], str]]] = {
+    "episodes used": ("episodes_used", lambda summary: f"{summary['episodes_used']:.1f}"),
     "prompts scored": ("prompts_scored", lambda summary: f"{summary['prompts_scored']:.0f}"),
     "success rate": ("success_rate", lambda summary: f"{100 * summary['success_rate']:.1f} %"),
     "SPL": ("spl", lambda summary: f"{summary['spl']:.3f}"),

@@ -29,6 +29,7 @@ from mgpo_jax.settings import (
     RECIPE_NETWORK,
     Count,
     EncoderName,
+    Finite,
     Head,
     Name,
     NotNegative,
@@ -443,6 +444,8 @@ class AdaptConfig(Common):
     """Episodes between evaluations of the best choice, which are outside of the budget."""
     eval_episodes: NumEpisodes | None = None
     """Episodes that an evaluation averages (default: as the world's record says)."""
+    stop_at: Finite | None = None
+    """End the search of a task as soon as its best choice is evaluated at this return or more."""
     obs_noise: NotNegative = 0.0
     """Standard deviation of noise on observations, in their units: search and evaluations run behind it."""
     action_noise: NotNegative = 0.0

@@ -105,6 +105,8 @@ class Summary(TypedDict):
     episodes under the optimized prompt that did. It is counted in single episodes, as the next is."""
     spl: NotRequired[Fraction]
     """Success weighted by path length (``statistics.Arrivals``)."""
+    episodes_used: NotRequired[Amount]
+    """With ``--stop-at``: episodes until a search ended, on average."""
     prompts_scored: NotRequired[Amount]
     """Of methods that ask the policy about prompts without spending an episode: how many in a search."""
     failed_episodes: Tally
@@ -145,6 +147,7 @@ def summarize(
         **_of_sampling(results),
         **_of_named_goals(results),
         **_of_scoring(results),
+        **_of_stopping(results),
         "failed_episodes": num_failed,
         "cpu_seconds": cpu_seconds,
         "episodes_per_cpu_second": num_episodes / cpu_seconds,
@@ -194,6 +197,12 @@ def _of_scoring(results: Results) -> dict[str, Any]:
     if results.num_scored is None:
         return {}
     return {"prompts_scored": float(results.num_scored[:, :, -1].mean())}
+
+
+def _of_stopping(results: Results) -> dict[str, Any]:
+    """The entry ``episodes_used`` of a summary, of searches that may end early."""
+    used = results.episodes_used
+    return {} if used is None else {"episodes_used": float(used.mean())}
 
 
 def _of_sampling(results: Results) -> dict[str, Any]:
@@ -455,6 +464,11 @@ def printed(summary: Mapping[str, Any]) -> str:
                 "unsolvable tasks",
                 f"{unsolvable} of {summary['num_tasks']} (never within the horizon)",
             )
+        )
+    if used := summary.get("episodes_used"):
+        saved = 100 * (1 - used / summary["num_episodes"])
+        rows.append(
+            ("episodes used", f"{used:.1f} in a search ({saved:.0f} % of the budget saved)")
         )
     if scored := summary.get("prompts_scored"):
         num = summary["num_tasks"] * summary["num_seeds"]

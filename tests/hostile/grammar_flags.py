@@ -104,6 +104,8 @@ CONTRADICTIONS: dict[str, tuple[tuple[str, str], ...]] = {
         ("--method envs.maze:MAZE15", "MAZE15"),
         ("--env gridworld", "policy"),
         ("--action-noise 1.5", "--action-noise"),
+        ("--sweep c", "c=0.1,1,10"),
+        ("--sweep min-std=1,2", "min_std"),
     ),
     "evaluate": (
         ("--env gridworld", "gridworld"),
@@ -176,6 +178,8 @@ VALID: dict[str, tuple[str, ...]] = {
         "--seed 4294967295",
         "--figures",
         "--obs-noise 0.02 --action-noise 0.1",
+        "--stop-at -0.5",
+        "--sweep c=0.5,2",
     ),
     "evaluate": ("--obs-noise 0 --action-noise 0.5", "--episodes 1", "--env maze15"),
     "check": ("--env maze15",),
