@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import sys
 from collections.abc import Iterable, Sequence
@@ -68,7 +69,7 @@ def main(config: AdaptConfig) -> None:
         print(f"{folder} is finished already", file=sys.stderr)
     else:
         results = adapt_and_save(folder, config, world, env, policy, tasks)
-    say(printed(results.summary))
+    say(json.dumps(results.summary, indent=2) if config.json else printed(results.summary))
     if config.figures:
         from experiments.drawing import draw_run
 

@@ -74,7 +74,9 @@ def adapt_all(
     )
 
 
-NOT_DECIDING = ("debug", "figures", "out", "policy", "resume", "sweep", "tasks")
+NOT_DECIDING = (
+    "config", "debug", "figures", "json", "out", "policy", "quiet", "resume", "sweep", "tasks",
+)  # fmt: skip
 """Settings of the command that do not decide about its results, or whose content is hashed instead."""
 ADDED = ("obs_noise", "action_noise", "stop_at")
 """Settings that count where they are given: work that was begun before there were these goes on."""

@@ -32,6 +32,7 @@ from tyro.constructors import (
 )
 
 from envs.errors import UsageError, shown
+from experiments.config_files import expanded
 from mgpo_jax.settings import check_values, flag, is_settings, range_of, types_of
 
 Defaults = Callable[[Any, Sequence[str]], Any]
@@ -62,6 +63,7 @@ def parse(
     words = list(argv)
     if words and words[0].replace("_", "-").startswith("--tyro-"):  # tyro would write a file
         _refuse_unknown(words, [], prog)
+    words = expanded(words, config_class)
     options: dict[str, Any] = {"description": description}
     if default is not None:
         first, unknown = _read(words, config_class, prog, add_help=False)

@@ -23,7 +23,7 @@ import threading
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -45,6 +45,10 @@ class Common:
 
     debug: bool = False
     """Show the traceback of an error."""
+    quiet: bool = False
+    """Say nothing on stderr but an error: no progress, no notes."""
+    config: Path | None = None
+    """A ``config.json`` of a run, whose settings stand where no flag is given."""
 
 
 def configure() -> None:
@@ -130,8 +134,9 @@ def run(
 
             text = main.__doc__ or ""
             config = parse(config_class, words, default, description=text, prog=program_name())
-            configure()
-            main(config)
+            with _silence() if config.quiet else nullcontext():
+                configure()
+                main(config)
     except signals.Stopped as stop:
         _fail(str(stop), 128 + stop.number, debug, "")
     except KeyboardInterrupt:
@@ -178,6 +183,23 @@ class _Tolerant:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
+
+
+class _Silent(_Tolerant):
+    """A stream that shows nothing."""
+
+    def write(self, text: str) -> int:
+        return len(text)
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Show nothing of what is written to stderr; an error that leaves the block is shown after it."""
+    stream, sys.stderr = sys.stderr, _Silent(sys.stderr)
+    try:
+        yield
+    finally:
+        sys.stderr = stream
 
 
 def say(text: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import json
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -81,9 +82,10 @@ def show(config: AdaptConfig, folders: Sequence[Path]) -> None:
     from experiments.drawing import write
     from experiments.figures import later, learning_curve
     from experiments.store.results import load_results
-    from experiments.store.rows import comparison, read_row
+    from experiments.store.rows import as_json, comparison, read_row
 
-    say(comparison([read_row(folder) for folder in folders]))
+    rows = [read_row(folder) for folder in folders]
+    say(json.dumps([as_json(row) for row in rows], indent=2) if config.json else comparison(rows))
     if config.figures:
         curves = {f"{config.method} ({f.name})": load_results(f, parts=()) for f in folders}
         write(config.folder / "learning_curve.png", later(learning_curve, curves, config.env))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,14 +19,17 @@ class TableConfig(Common):
 
     runs: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Result folders of adaptations."""
+    json: bool = False
+    """Print JSON: a list of summaries, each with its folder, tasks and settings."""
 
 
 def main(config: TableConfig) -> None:
     """Print a Markdown table of adaptations, where it is fair beside the paper's Table 2."""
     require_runs(config.runs, "table")
-    from experiments.store.rows import comparison, read_row
+    from experiments.store.rows import as_json, comparison, read_row
 
-    say(comparison([read_row(folder) for folder in config.runs]))
+    rows = [read_row(folder) for folder in config.runs]
+    say(json.dumps([as_json(row) for row in rows], indent=2) if config.json else comparison(rows))
 
 
 def command(argv: Sequence[str] | None = None) -> NoReturn:

@@ -75,6 +75,12 @@ class Row(NamedTuple):
         )
 
 
+def as_json(row: Row) -> dict[str, Any]:
+    """Everything that a row is made of, as JSON values."""
+    about = {"folder": row.folder, "tasks": row.tasks, "settings": dict(row.settings)}
+    return {**about, **row.summary}
+
+
 def read_row(folder: Path) -> Row:
     """Read what a table says of an adaptation.
 

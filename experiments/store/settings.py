@@ -354,8 +354,11 @@ def check_initial(config: PretrainConfig) -> None:
 
 
 NO_SETTINGS = frozenset(
-    {"preset", "init", "out", "resume", "debug", "tb", "wandb", "eval_every", "save_every"}
-)
+    {
+        "preset", "init", "out", "resume", "debug", "quiet", "config", "tb", "wandb", "eval_every",
+        "save_every",
+    }
+)  # fmt: skip
 """Settings that may differ when a run is resumed: they do not change its weights. For the place of the
 policy to start from, the hash of its weights counts."""
 
@@ -459,6 +462,8 @@ class AdaptConfig(Common):
     """Result folder (default: runs/adapt/ENV/METHOD-seedSEED, with the noise behind it)."""
     figures: bool = True
     """Draw the figures."""
+    json: bool = False
+    """Print the summary as JSON."""
     resume: bool = False
     """Go on with an adaptation that was stopped; the result is the same as without a stop."""
     hyper: Annotated[Any, tyro.conf.arg(name="")] = field(default_factory=NoHyper)

@@ -1,0 +1,99 @@
+"""``--config FILE``: the settings of a run, from its ``config.json``, as words of a command line.
+
+They stand where the user gave no flag, and are read and checked like words that were typed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, get_args
+
+from envs.errors import DataError, UsageError, shown
+from mgpo_jax.schema import Json, read_document
+from mgpo_jax.settings import flag, is_settings, types_of
+
+OWN = frozenset({"config", "debug", "quiet", "json", "out", "resume"})
+"""Settings of one call of a command, which another one does not take over."""
+GROUPS = frozenset({"data", "train", "hyper"})
+"""Groups of settings in ``config.json``, whose flags are those of their members."""
+CHOOSER = {"hyper": "method"}
+"""A group of no use where a setting is typed: hyper-parameters where another method is named."""
+
+
+def expanded(words: Sequence[str], config_class: type) -> list[str]:
+    """The words of a command line with those of the file that ``--config`` names after them.
+
+    Args:
+      words: what was typed.
+      config_class: the dataclass of the command's settings, for other names of its flags.
+
+    Raises:
+      UsageError: if ``--config`` has no value.
+      DataError: if the file is damaged or holds no settings.
+    """
+    typed = list(itertools.takewhile(lambda word: word != "--", words))
+    path = _file_in(typed)
+    if path is None:
+        return list(words)
+    names = _names(config_class)
+    given = {names.get(name, name) for name in map(_name_of, typed) if name}
+    values = read_document(path, dict[str, Json], "give the config.json of a run")
+    added = [word for name, value in _settings(values, given) for word in _words(name, value)]
+    return [*typed, *added, *words[len(typed) :]]
+
+
+def _file_in(words: Sequence[str]) -> Path | None:
+    for word, following in itertools.zip_longest(words, words[1:]):
+        if _name_of(word) != "config":
+            continue
+        _, sign, value = word.partition("=")
+        found = value if sign else following
+        if not found or (not sign and found.startswith("--")):
+            raise UsageError("--config needs a value: the config.json of a run")
+        return Path(found)
+    return None
+
+
+def _name_of(word: str) -> str:
+    """The setting that a word gives: ``no_figures`` and ``--figures`` are one; empty for a value."""
+    if not word.startswith("--"):
+        return ""
+    name = word.partition("=")[0].removeprefix("--").replace("-", "_")
+    return name.removeprefix("no_")
+
+
+def _names(config_class: type) -> dict[str, str]:
+    """Other names of settings, and the settings."""
+    found: dict[str, str] = {}
+    config: Any = config_class()
+    for field in dataclasses.fields(config):
+        if is_settings(getattr(config, field.name)):
+            found |= _names(type(getattr(config, field.name)))
+        for extra in get_args(types_of(config_class).get(field.name))[1:]:
+            for alias in getattr(extra, "aliases", None) or ():
+                found[_name_of(alias)] = field.name
+    return found
+
+
+def _settings(values: Mapping[str, Any], given: set[str]) -> Iterator[tuple[str, Any]]:
+    """Settings of the file that nobody typed; those of groups, too."""
+    for name, value in values.items():
+        if name in GROUPS and isinstance(value, Mapping):
+            if CHOOSER.get(name) not in given:
+                yield from _settings(value, given)
+        elif name not in OWN and name not in given and value is not None:
+            if isinstance(value, Mapping):
+                raise DataError(f"the config has no setting {shown(name)} of one value")
+            yield name, value
+
+
+def _words(name: str, value: Any) -> list[str]:
+    """A setting as words of a command line."""
+    if isinstance(value, bool):
+        return [flag(name) if value else flag(f"no_{name}")]
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [flag(name), *map(str, value)] if value else []
+    return [f"{flag(name)}={value}"]
