@@ -204,10 +204,7 @@ def sweep(
       DataError: if the policy was made for another world, or a return is not finite.
     """
     _check_positive(seeds=seeds, episodes=episodes, eval_every=eval_every)
-    check_fits(policy.config, env.spec)
-    setting = Setting(env, policy.config, episodes, judged or Judgement())
-    for hyper in hypers:
-        method.check_use(setting, hyper)
+    setting = _checked_setting(env, policy, method, hypers, episodes, judged)
     fixed, numbers = split_hyper(hypers)
     adapter = method.adapter(setting, policy.params, hypers[0])
     segments = _segments(adapter, episodes, eval_every)
@@ -215,21 +212,35 @@ def sweep(
     _check_room(env, grid, episodes)
     layout = _lay_out(env, grid.size, _memory_bytes(env, adapter, tasks))
     program = _program(method, setting, fixed, layout, max(segments), keep_actions)
-    own = grid.lanes(layout, tasks, seed, numbers)
-    if stop_at is not None:
-        own = own._replace(stopped=jnp.zeros(layout.num_lanes, bool))
-    lanes = split(layout.mesh, own)
+    lanes = grid.lanes(layout, tasks, seed, numbers, ends_early=stop_at is not None)
     params = replicate(layout.mesh, policy.params)
     per_round = adapter.episodes_per_round * grid.size
-    journal = journal or Journal()
-    run = Run(program, lanes, params, segments, grid, layout, per_round, stop_at)
-    record, cpu = _run(run, journal)
+    run = Run(
+        program, split(layout.mesh, lanes), params, segments, grid, layout, per_round, stop_at
+    )
+    record, cpu = _run(run, journal or Journal())
     # The search, too, begins with one evaluation of the initial choice.
     after = np.concatenate([[1], np.cumsum(segments) * adapter.episodes_per_round])
     per_lane = episodes + (len(segments) + 1) * setting.judged.episodes
     num = len(hypers)
     total = round(layout.num_lanes * per_lane / num)
     return [record.outcome(i, grid, after, total, cpu / num) for i in range(num)]
+
+
+def _checked_setting(
+    env: Environment,
+    policy: LoadedPolicy,
+    method: Method,
+    hypers: Sequence[Any],
+    episodes: int,
+    judged: Judgement | None,
+) -> Setting:
+    """What a method may know before it sees a task, if it can be used there."""
+    check_fits(policy.config, env.spec)
+    setting = Setting(env, policy.config, episodes, judged or Judgement())
+    for hyper in hypers:
+        method.check_use(setting, hyper)
+    return setting
 
 
 def _check_positive(**numbers: int) -> None:
@@ -298,9 +309,14 @@ class Grid:
         return self.variants * self.seeds * self.tasks
 
     def lanes(
-        self, layout: Layout, tasks: Task, seed: int, numbers: dict[str, list[int | float]]
+        self,
+        layout: Layout,
+        tasks: Task,
+        seed: int,
+        numbers: dict[str, list[int | float]],
+        ends_early: bool = False,
     ) -> Lanes:
-        """The lanes; those beyond the last variant repeat the first ones to fill up a group."""
+        """The lanes, of which any may have stopped if ``ends_early``; those beyond the last variant repeat the first ones to fill up a group."""
         index = np.arange(layout.num_lanes)
         runs = self.seeds * self.tasks
         which = index // runs % self.variants
@@ -308,6 +324,7 @@ class Grid:
             task=jax.tree.map(lambda leaf: jnp.asarray(leaf)[index % self.tasks], tasks),
             key=jax.random.split(jax.random.key(seed), runs)[index % runs],
             numbers={name: jnp.array(values)[which] for name, values in numbers.items()},
+            stopped=jnp.zeros(layout.num_lanes, bool) if ends_early else None,
         )
 
     def shape(self, rows: np.ndarray) -> np.ndarray:
