@@ -207,24 +207,22 @@ def sweep(
     setting = _checked_setting(env, policy, method, hypers, episodes, judged)
     fixed, numbers = split_hyper(hypers)
     adapter = method.adapter(setting, policy.params, hypers[0])
-    segments = _segments(adapter, episodes, eval_every)
+    segments, num = _segments(adapter, episodes, eval_every), adapter.episodes_per_round
     grid = Grid(variants=len(hypers), seeds=seeds, tasks=num_tasks(tasks))
     _check_room(env, grid, episodes)
     layout = _lay_out(env, grid.size, _memory_bytes(env, adapter, tasks))
     program = _program(method, setting, fixed, layout, max(segments), keep_actions)
     lanes = grid.lanes(layout, tasks, seed, numbers, ends_early=stop_at is not None)
+    lanes = split(layout.mesh, lanes)
     params = replicate(layout.mesh, policy.params)
-    per_round = adapter.episodes_per_round * grid.size
-    run = Run(
-        program, split(layout.mesh, lanes), params, segments, grid, layout, per_round, stop_at
-    )
+    run = Run(program, lanes, params, segments, grid, layout, num * grid.size, stop_at)
     record, cpu = _run(run, journal or Journal())
     # The search, too, begins with one evaluation of the initial choice.
-    after = np.concatenate([[1], np.cumsum(segments) * adapter.episodes_per_round])
+    after = np.concatenate([[1], np.cumsum(segments) * num])
     per_lane = episodes + (len(segments) + 1) * setting.judged.episodes
-    num = len(hypers)
-    total = round(layout.num_lanes * per_lane / num)
-    return [record.outcome(i, grid, after, total, cpu / num) for i in range(num)]
+    total = round(layout.num_lanes * per_lane / grid.variants)
+    cpu /= grid.variants
+    return [record.outcome(i, grid, after, total, cpu) for i in range(grid.variants)]
 
 
 def _checked_setting(
@@ -316,7 +314,10 @@ class Grid:
         numbers: dict[str, list[int | float]],
         ends_early: bool = False,
     ) -> Lanes:
-        """The lanes, of which any may have stopped if ``ends_early``; those beyond the last variant repeat the first ones to fill up a group."""
+        """The lanes; those beyond the last variant repeat the first ones to fill up a group.
+
+        With ``ends_early`` each says whether it has stopped.
+        """
         index = np.arange(layout.num_lanes)
         runs = self.seeds * self.tasks
         which = index // runs % self.variants
