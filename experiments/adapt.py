@@ -60,6 +60,11 @@ def main(config: AdaptConfig) -> None:
     env = behind_noise(envs.make(config.env), config.obs_noise, config.action_noise)
     policy = load_policy(world, config.policy, methods.find(config.method).policy)
     tasks = chosen_tasks(world, env, config.tasks, config.validation, config.validation_seed)
+    if config.dry_run:
+        from experiments.forecasts import of_adaptation
+
+        say(of_adaptation(config, world, env, policy, tasks))
+        return
     if config.sweep:
         show(config, sweep_and_save(config, world, env, policy, tasks))
         print(f"results in {folder}", file=sys.stderr)

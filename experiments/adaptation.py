@@ -75,7 +75,7 @@ def adapt_all(
 
 
 NOT_DECIDING = (
-    "config", "debug", "figures", "json", "out", "policy", "quiet", "resume", "sweep", "tasks",
+    "config", "debug", "dry_run", "figures", "json", "out", "policy", "quiet", "resume", "sweep", "tasks",
 )  # fmt: skip
 """Settings of the command that do not decide about its results, or whose content is hashed instead."""
 ADDED = ("obs_noise", "action_noise", "stop_at")

@@ -167,13 +167,13 @@ def _of_ablation(config: ReproduceConfig) -> Iterator[Piece]:
             yield Piece(False, _estimate(config, settings))
     for folder, training in trainings.items():
         done = runs.is_finished(folder)
-        price = _seconds_in(folder) if done else _price_of(training)
+        price = _seconds_in(folder) if done else price_of(training)
         yield Piece(done, price, counts=False)
 
 
-def _price_of(training: PretrainConfig) -> float | None:
+def price_of(training: PretrainConfig) -> float | None:
     """CPU-seconds of a training at the speed of the released policy's; None where there is none."""
-    place = released_folder(envs.find(training.env))
+    place = released_folder(envs.find(training.env), training.method)
     seconds, steps = _seconds_in(place), _steps_in(place)
     return None if seconds is None or not steps else seconds / steps * training.train.steps
 

@@ -252,14 +252,19 @@ def _check_room(env: Environment, grid: Grid, episodes: int) -> None:
     """Raise ``UsageError`` for an adaptation without tasks, or whose log does not fit into memory."""
     if not grid.size:
         raise UsageError("there are no tasks to adapt to")
-    a_step = 2 * 4 * env.spec.goal_dim + 4  # achieved goals and outcomes are most of what is kept
-    needed = grid.size * episodes * env.spec.horizon * a_step
+    needed = log_bytes(env, grid.size, episodes)
     room = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if needed > room:
         raise UsageError(
             f"{grid.size:,} adaptations of {episodes:,} episodes need {needed / 1e9:,.0f} GB of memory, "
             f"this machine has {room / 1e9:.0f} GB; adapt with fewer --seeds, --episodes or tasks at once"
         )
+
+
+def log_bytes(env: Environment, num_lanes: int, episodes: int) -> int:
+    """Bytes of the log of so many adaptations at most: achieved goals and outcomes are most of it."""
+    a_step = 2 * 4 * env.spec.goal_dim + 4
+    return num_lanes * episodes * env.spec.horizon * a_step
 
 
 def _segments(adapter: Adapter, episodes: int, eval_every: int) -> list[int]:

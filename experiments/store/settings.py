@@ -147,6 +147,8 @@ class PretrainConfig(Common):
     """Run folder (default: runs/pretrain/ENV/PRESET-seedSEED, with the method before the preset)."""
     resume: bool = False
     """Continue an interrupted run from its newest checkpoint, bit for bit."""
+    dry_run: bool = False
+    """Only say what would be done, and some CPU time that it takes."""
     tb: bool = False
     """Also write metrics for TensorBoard (extra: tb)."""
     wandb: bool = False
@@ -355,8 +357,8 @@ def check_initial(config: PretrainConfig) -> None:
 
 NO_SETTINGS = frozenset(
     {
-        "preset", "init", "out", "resume", "debug", "quiet", "config", "tb", "wandb", "eval_every",
-        "save_every",
+        "preset", "init", "out", "resume", "debug", "quiet", "config", "dry_run", "tb", "wandb",
+        "eval_every", "save_every",
     }
 )  # fmt: skip
 """Settings that may differ when a run is resumed: they do not change its weights. For the place of the
@@ -464,6 +466,8 @@ class AdaptConfig(Common):
     """Draw the figures."""
     json: bool = False
     """Print the summary as JSON."""
+    dry_run: bool = False
+    """Only say what would be done, and some CPU time that it takes."""
     resume: bool = False
     """Go on with an adaptation that was stopped; the result is the same as without a stop."""
     hyper: Annotated[Any, tyro.conf.arg(name="")] = field(default_factory=NoHyper)

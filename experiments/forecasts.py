@@ -1,0 +1,101 @@
+"""``--dry-run``: what a command would do, in numbers, without doing it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from math import ceil
+from typing import Any
+
+import jax
+
+from envs.base import Environment, Task
+from envs.registry import World
+from experiments.inventory import price_of, seconds_per_episode
+from experiments.store.settings import AdaptConfig, PretrainConfig
+from experiments.store.summary import judged_episodes
+from experiments.store.tables import block
+from mgpo_jax import methods
+from mgpo_jax.files import to_json
+from mgpo_jax.policy import LoadedPolicy
+from mgpo_jax.runner import log_bytes
+from mgpo_jax.tasks import num_tasks
+from mgpo_jax.training import initial_params
+from mgpo_jax.transformer import TransformerConfig
+
+OPTIMIZER = 3  # weights, their gradient and a moment, at least, in a gradient step
+
+
+def of_adaptation(
+    config: AdaptConfig, world: World, env: Environment, policy: LoadedPolicy, tasks: Task
+) -> str:
+    """What ``adapt`` would do: searches, episodes, memory and CPU time.
+
+    The CPU time is that of published adaptations in this world (``inventory.seconds_per_episode``).
+    """
+    num, method = num_tasks(tasks), methods.find(config.method)
+    lanes = num * config.seeds * _num_variants(config)
+    judgements = 1 + ceil(config.episodes / config.eval_every)
+    judged = judgements * (judged_episodes(to_json(config), world) or 1)
+    rate = seconds_per_episode(config.env, method)
+    rows = [
+        ("searches", f"{num} tasks x {config.seeds} seeds x {_num_variants(config)} variants"),
+        ("episodes", f"{lanes * config.episodes:,} of the searches, {lanes * judged:,} that judge"),
+        ("steps", f"at most {lanes * (config.episodes + judged) * env.spec.horizon:,}"),
+        ("network", f"{_num_weights(policy.params):,} weights"),
+        ("memory", f"{log_bytes(env, lanes, config.episodes) / 1e6:,.0f} MB of results at most"),
+        ("CPU time", _told(None if rate is None else rate * lanes * (config.episodes + judged))),
+        ("results", str(config.folder)),
+    ]
+    return block(f"{config.env}, {config.method}: nothing is done yet", rows)
+
+
+def _num_variants(config: AdaptConfig) -> int:
+    if not config.sweep:
+        return 1
+    from experiments.sweeping import variants
+
+    return len(variants(config))
+
+
+def of_training(config: PretrainConfig, network: Any, env_steps: int) -> str:
+    """What ``pretrain`` would do: the network, its batches, memory and CPU time.
+
+    Args:
+      config: the settings.
+      network: the config of the network; only that of the multi-goal Transformer has its weights counted.
+      env_steps: T, the longest trajectory.
+
+    The CPU time is that of the released policy of this world (``inventory.price_of``).
+    """
+    train = config.train
+    rows = [("trajectories", f"{config.data.trajectories:,}, {config.holdout:,} of them held out")]
+    if isinstance(network, TransformerConfig):
+        shapes = jax.eval_shape(lambda key: initial_params(key, network), jax.random.key(0))
+        num = _num_weights(shapes)
+        tokens = network.max_prompt_length + network.num_step_tokens(env_steps)
+        rows += [
+            ("network", f"{num:,} weights"),
+            ("tokens", f"at most {tokens:,} a trajectory"),
+            ("memory", f"{4 * OPTIMIZER * num / 1e6:,.0f} MB for weights, beside data and a batch"),
+        ]
+    rows += [
+        ("batches", f"{train.batch_size} trajectories in parts of {train.part_size}"),
+        ("steps", f"{train.steps:,}"),
+        ("CPU time", _told(price_of(config))),
+        ("run", str(config.folder)),
+    ]
+    return block(f"{config.env}, {config.method}: nothing is done yet", rows)
+
+
+def _num_weights(params: Any) -> int:
+    leaves: Iterable[Any] = jax.tree.leaves(params)
+    return sum(math.prod(leaf.shape) for leaf in leaves)
+
+
+def _told(seconds: float | None) -> str:
+    if seconds is None:
+        return "not known: nothing like it was measured"
+    if seconds < 120:
+        return f"some {seconds:.0f} seconds, and compiling"
+    return f"some {seconds / 60:.0f} minutes, and compiling"

@@ -1,0 +1,37 @@
+"""``--dry-run`` says in numbers what would be done, and does nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from experiments import adapt
+from experiments.parsing import parse
+from experiments.store.settings import AdaptConfig
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_an_adaptation_is_only_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(ROOT)  # published results tell the speed
+    words = f"--episodes 40 --seeds 2 --sweep c=1,2 --dry-run --out {tmp_path}/new"
+    adapt.main(parse(AdaptConfig, words.split(), adapt.adapt_default))
+    found = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()[2:])
+    assert found["searches"] == "50 tasks x 2 seeds x 2 variants"
+    assert found["episodes"] == "8,000 of the searches, 1,000 that judge"  # after 1, 10, .., 40
+    assert found["steps"] == f"at most {9_000 * 64:,}"
+    assert found["network"] == "606,853 weights"
+    assert found["CPU"].startswith("time some ")
+    assert not (tmp_path / "new").exists()
+
+
+def test_what_was_never_measured_is_not_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    adapt.main(parse(AdaptConfig, ["--dry-run"], adapt.adapt_default))
+    assert "not known" in capsys.readouterr().out
+    assert not list(tmp_path.iterdir())
