@@ -38,30 +38,51 @@ interface Scene {
   earlier?: any[][];
   /** Draw only what the moments have seen. */
   onlySeen?: boolean;
+  /** What a search has seen, to be drawn in the place of everything else of the task. */
+  known?: Known;
   /** Where the keyboard is. */
   cursor?: Spot | null;
+}
+
+/** The map of a search: goals that stand for states. */
+interface Known {
+  goals: Goal[];
+  /** How often each was visited. */
+  visits: number[];
+  /** The shortest known way to the task goal, without its start. */
+  way: Goal[];
 }
 
 /** Colors by name, for the light or the dark page. */
 type Colors = Record<string, string>;
 
-/** What a world brings to the pages. */
-interface WorldPage {
-  /** Names of the actions. */
-  actions: string[];
-  play(facts: any, task: any): Play;
+/** What a world brings to the report: how it is drawn. */
+interface WorldDrawing {
   /** A goal in a few characters. */
   goalName(facts: any, goal: Goal): string;
-  taskGoal(facts: any, task: any): Goal;
   /** Width and height in units of the drawing. */
   size(facts: any): [number, number];
   draw(context: CanvasRenderingContext2D, facts: any, scene: Scene, colors: Colors): void;
   /** What the drawing shows, for those who do not see it. */
   tell(facts: any, scene: Scene): string;
-  /** Whether the drawing can be of what was seen only. */
-  hidesUnseen: boolean;
   /** What the marks of the drawing mean. */
   legend: [string, string][];
+  /** What the marks of a drawing of `known` mean, for a world that draws it. */
+  legendOfKnown?: [string, string][];
+  /** An episode in progress, for a world whose rules are in the script. */
+  play?(facts: any, task: any): Play;
+  /** The moments of an episode from what `Page.track` says of them, for a world whose rules are not. */
+  moments?(rows: number[][]): any[];
+}
+
+/** What a world brings that also has a playground. */
+interface WorldPage extends WorldDrawing {
+  /** Names of the actions. */
+  actions: string[];
+  play(facts: any, task: any): Play;
+  taskGoal(facts: any, task: any): Goal;
+  /** Whether the drawing can be of what was seen only. */
+  hidesUnseen: boolean;
   /** The spots that can be chosen: rows and columns. */
   spots(facts: any): [number, number];
   /** The goal that a spot stands for. */

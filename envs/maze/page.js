@@ -148,15 +148,23 @@ function countVisits({ side }, walks) {
   return visits;
 }
 
+/** How often a search visited each cell that it knows. @type {(facts: Facts, known: Known) => Map<number, number>} */
+function knownVisits(facts, { goals, visits }) {
+  return new Map(goals.flatMap((goal, i) => {
+    const cell = cellOf(facts, goal);
+    return cell ? [[cell.row * facts.side + cell.column, visits[i]]] : [];
+  }));
+}
+
 /** @type {WorldPage["draw"]} */
-function draw(context, facts, { task, goals, moments, earlier, onlySeen, cursor }, colors) {
+function draw(context, facts, { task, goals, moments, earlier, onlySeen, known, cursor }, colors) {
   const { side } = facts;
-  const seen = onlySeen ? cellsSeen(facts, moments) : null;
-  const visits = countVisits(facts, earlier ?? []), most = Math.max(1, ...visits.values());
+  const visits = known ? knownVisits(facts, known) : countVisits(facts, earlier ?? []), most = Math.max(1, ...visits.values());
+  const seen = known ? new Set(visits.keys()) : onlySeen ? cellsSeen(facts, moments) : null;
   const inSight = earlier ? new Set() : cellsSeen(facts, moments.slice(-1));
   for (let row = 0; row < side; row++)
     for (let column = 0; column < side; column++) {
-      const at = row * side + column, hidden = seen && !seen.has(at);
+      const at = row * side + column, hidden = seen && !seen.has(at) && !(known && isWall(task, row, column));
       context.fillStyle = hidden ? colors.hidden : isWall(task, row, column) ? colors.wall : colors.free;
       context.fillRect(column, row, 1.02, 1.02);
       if (hidden || isWall(task, row, column)) continue;
@@ -171,6 +179,7 @@ function draw(context, facts, { task, goals, moments, earlier, onlySeen, cursor 
       context.strokeRect(column, row, 1, 1);
     }
   drawWalk(context, moments, colors);
+  if (known) drawWay(context, facts, known.way, colors);
   const unit = Math.max(1, side / 19);
   const [startRow, startColumn] = facts.start;
   mark(context, startColumn, startRow, "S", colors.start, colors, unit, true);
@@ -202,6 +211,23 @@ function drawWalk(context, moments, colors) {
     context.stroke();
   }
   context.globalAlpha = 1;
+}
+
+/** A way from the start as a line with a pale rim. @param {CanvasRenderingContext2D} context @param {Facts} facts @param {Goal[]} way @param {Colors} colors */
+function drawWay(context, facts, way, colors) {
+  if (!way.length) return;
+  context.beginPath();
+  context.moveTo(facts.start[1] + 0.5, facts.start[0] + 0.5);
+  for (const goal of way) {
+    const cell = cellOf(facts, goal);
+    if (cell) context.lineTo(cell.column + 0.5, cell.row + 0.5);
+  }
+  context.lineCap = context.lineJoin = "round";
+  for (const [color, width] of /** @type {[string, number][]} */ ([[colors.paper, 0.36], [colors.agent, 0.2]])) {
+    context.strokeStyle = color;
+    context.lineWidth = width;
+    context.stroke();
+  }
 }
 
 /** @param {CanvasRenderingContext2D} context @param {Moment} moment @param {Colors} colors @param {number} unit */
@@ -260,6 +286,12 @@ export const world = {
     ["prompt", "1, 2, ..: goals of the prompt in their order"],
     ["agent", "agent and its path"],
     ["wall", "wall"],
+  ],
+  legendOfKnown: [
+    ["visit", "known, darker the more often it was visited"],
+    ["hidden", "not known"],
+    ["agent", "shortest known way"],
+    ["prompt", "best prompt so far"],
   ],
   spots: ({ side }) => [side, side],
   goalAt: (facts, task, { row, column }) => (isInside(facts, { row, column }) ? goalOf(facts, row, column) : null),

@@ -44,13 +44,13 @@ def knowledge_of(results: Results) -> Knowledge | None:
     Raises:
       DataError: if the method, as it is now, does not come to the prompts on record.
     """
-    adapter = _adapter_of(results)
-    if adapter is None:
+    found = told_adapter(results)
+    if found is None or not isinstance(getattr(found[1], "arms", None), Arms):
         return None
-    spec = results.world.make().spec
+    adapter, spec = found[0], results.world.make().spec
     names = ("prompt.goals", "prompt.mask", "greedy")
     goals, mask, greedy = (jnp.asarray(results.choices[name]) for name in names)
-    blank = _blank_episode(spec)
+    blank = blank_episode(spec)
 
     def lane(
         blank: Episode, task_goal: Any, goals: Any, mask: Any, greedy: Any, returns: Any
@@ -70,20 +70,29 @@ def knowledge_of(results: Results) -> Knowledge | None:
         return jax.lax.scan(told, first, (goals, mask, greedy, returns))[1]
 
     lanes = jax.jit(jax.vmap(jax.vmap(lane, (None, 0, 0, 0, 0, 0)), (None, None, 0, 0, 0, 0)))
-    found = lanes(
+    changes = lanes(
         blank, jnp.asarray(results.task_goals), goals, mask, greedy, jnp.asarray(results.returns)
     )
-    row, pulls, mean, fits = (np.asarray(leaf) for leaf in found)
+    row, pulls, mean, fits = (np.asarray(leaf) for leaf in changes)
     if not fits.all():
-        raise DataError(
-            f"{results.method}, told the recorded returns, acts with other prompts than those on record: "
-            "they were made by another version"
-        )
+        raise disagreement(results)
     return Knowledge(row.astype(np.uint8), pulls.astype(np.uint8), mean)
 
 
-def _adapter_of(results: Results) -> Adapter | None:
-    """The method of some results, with their settings; None for one without arms, or not of today."""
+def disagreement(results: Results) -> DataError:
+    """What to say where a method, told the recorded episodes, does not come to the recorded prompts."""
+    return DataError(
+        f"{results.method}, told the recorded episodes, acts with other prompts than those on record: "
+        "they were made by another version"
+    )
+
+
+def told_adapter(results: Results) -> tuple[Adapter, Any] | None:
+    """The method of some results with their settings, and the shapes of its state.
+
+    It can be told episodes, but nobody can act, since it has no weights. None for a method without
+    prompts, or one that is not of today.
+    """
     config = results.config
     slots = results.choices["prompt.mask"].shape[-1] if "prompt.mask" in results.choices else 0
     values = config.get("hyper")
@@ -104,11 +113,10 @@ def _adapter_of(results: Results) -> Adapter | None:
         state = jax.eval_shape(adapter.init, jax.random.key(0), jnp.zeros(env.spec.goal_dim))
     except Exception:  # a method of a user that needs its weights, or settings of an older version
         return None
-    has_arms = isinstance(getattr(state, "arms", None), Arms)
-    return adapter if has_arms and adapter.episodes_per_round == 1 else None
+    return (adapter, state) if adapter.episodes_per_round == 1 else None
 
 
-def _blank_episode(spec: EnvSpec) -> Episode:
+def blank_episode(spec: EnvSpec) -> Episode:
     """An episode of which only the return will matter."""
     steps = spec.horizon
     obs = jnp.zeros((steps, *spec.obs.shape), spec.obs.dtype)

@@ -20,6 +20,7 @@ from experiments.figures import method_styles
 from experiments.pages.build import SCRIPTS, html, script_of
 from experiments.pages.knowledge import knowledge_of
 from experiments.pages.packing import packed, smallest
+from experiments.pages.plans import plan_of
 from experiments.pages.worlds import page_of, tasks_in_page
 from experiments.store.layout import META
 from experiments.store.paper import paper_final
@@ -161,13 +162,13 @@ def _compared(results: Results, first: Results) -> str:
 
 
 def _knowledge(results: Results) -> tuple[dict[str, np.ndarray], str]:
-    """The arms of the search after each episode, and a remark where they cannot be shown."""
+    """What the search knew after each episode, and a remark where that cannot be shown."""
     try:
         knowledge = knowledge_of(results)
+        if knowledge is None:
+            return plan_of(results), ""
     except DataError as error:
         return {}, str(error)
-    if knowledge is None:
-        return {}, ""
     return {"arm": knowledge.row, "pulls": smallest(knowledge.pulls)}, ""
 
 

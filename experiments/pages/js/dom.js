@@ -52,7 +52,7 @@ export function onScheme(draw) {
 
 /**
  * Draw a scene of a world on a canvas, as sharp as the screen allows.
- * @param {HTMLCanvasElement} canvas @param {WorldPage} world @param {any} facts @param {Scene} scene
+ * @param {HTMLCanvasElement} canvas @param {WorldDrawing} world @param {any} facts @param {Scene} scene
  */
 export function drawScene(canvas, world, facts, scene) {
   const context = canvas.getContext("2d");
@@ -76,9 +76,9 @@ export function spotAt(canvas, world, facts, event) {
   return row >= 0 && column >= 0 && row < rows && column < columns ? { row, column } : null;
 }
 
-/** What the marks mean, with their colors. @param {WorldPage} world */
-export function legendOf(world) {
-  return world.legend.map(([color, text]) => {
+/** What marks mean, with their colors. @param {[string, string][]} legend */
+export function legendOf(legend) {
+  return legend.map(([color, text]) => {
     const swatch = element("span", { class: "swatch", "aria-hidden": "true" });
     swatch.style.background = `var(--${color})`;
     return element("span", { class: "entry" }, swatch, text);

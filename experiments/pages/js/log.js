@@ -21,10 +21,18 @@ export class Log {
     this.numJudged = arrays.evalEpisodes.shape[0];
     this.hasPrompts = Boolean(arrays.choice);
     this.hasArms = Boolean(arrays.arm);
+    this.hasMap = Boolean(arrays.visits);
+    this.hasOrder = Boolean(arrays.prefix);
+    this.hasWorths = Boolean(arrays.worthEpisode);
     this.hasActions = Boolean(arrays.actions);
+    this.hasTracks = Boolean(arrays.track);
     if (this.hasPrompts) arrays.choice.data = decodeNew(arrays.choice.data);
     this.hasReached = Boolean(arrays.reachedCounts);
     this.actionsFrom = this.hasActions ? sums(arrays.lengths.data) : new Uint32Array(0);
+    // Of how many episodes one is tracked, the first of a search among them.
+    this.trackStride = this.hasTracks ? range(numEpisodes).findIndex((e) => e > 0 && arrays.trackCounts.data[e] > 0) : 0;
+    this.trackFrom = this.hasTracks ? sums(arrays.trackCounts.data) : new Uint32Array(0);
+    this.waysFrom = this.hasMap ? sums(arrays.wayCounts.data.map((/** @type {number} */ count) => Math.max(count - 1, 0))) : new Uint32Array(0);
     this.reachedFrom = this.hasReached ? sums(arrays.reachedCounts.data) : new Uint32Array(0);
   }
 
@@ -81,12 +89,83 @@ export class Log {
     return starts.data.subarray(at, at + size);
   }
 
+  /** Whether the moments of an episode are known. @param {number} seed @param {number} task @param {number} episode */
+  isTracked(seed, task, episode) {
+    return this.hasTracks && this.arrays.trackCounts.data[this.at(seed, task, episode)] > 0;
+  }
+
+  /** What the drawing has to know of each moment of an episode. @param {number} seed @param {number} task @param {number} episode @returns {number[][]} */
+  track(seed, task, episode) {
+    const { data, shape: [size, total] } = this.arrays.track, at = this.at(seed, task, episode);
+    const row = Array.from({ length: size }, () => 0);
+    return range(this.trackFrom[at + 1] - this.trackFrom[at]).map((i) => {
+      for (let k = 0; k < size; k++) row[k] = (row[k] + data[k * total + this.trackFrom[at] + i]) % 256;
+      return [...row];
+    });
+  }
+
   /** Goals that an episode reached, with their steps. @param {number} seed @param {number} task @param {number} episode @returns {{ step: number, goal: Goal }[]} */
   reached(seed, task, episode) {
     const at = this.at(seed, task, episode), { reachedSteps, reachedGoals, goals } = this.arrays, size = goals.shape[1];
     return range(this.reachedFrom[at + 1] - this.reachedFrom[at]).map((i) => {
       const place = this.reachedFrom[at] + i, goal = reachedGoals.data[place];
       return { step: reachedSteps.data[place] + 1, goal: goals.data.slice(goal * size, (goal + 1) * size) };
+    });
+  }
+
+  /** The goals that a search has found until its end, in this order. @param {number} seed @param {number} task @returns {Goal[]} */
+  found(seed, task) {
+    const { known, knownGoals } = this.arrays, num = known.shape[2], size = knownGoals.shape[1], at = (seed * this.numTasks + task) * num;
+    const places = Array.from(known.data.subarray(at, at + num), (place) => place - 1);
+    return places.filter((place) => place >= 0).map((place) => knownGoals.data.slice(place * size, (place + 1) * size));
+  }
+
+  /**
+   * The map after an episode: its states with their visits, and the shortest known way.
+   * @param {number} seed @param {number} task @param {number} episode
+   * @returns {{ goals: Goal[], visits: number[], way: Goal[], verified: number }}
+   */
+  map(seed, task, episode) {
+    const { visits, wayCounts, ways, verified } = this.arrays, num = visits.shape[3], goals = this.found(seed, task);
+    const counts = goals.map(() => 0);
+    /** @type {Goal[]} */
+    let way = [];
+    for (let e = 0; e <= episode; e++) {
+      const at = this.at(seed, task, e);
+      for (let i = 0; i < counts.length; i++) counts[i] += visits.data[at * num + i];
+      if (wayCounts.data[at]) way = Array.from(ways.data.subarray(this.waysFrom[at], this.waysFrom[at + 1]), (state) => goals[state]);
+    }
+    const isKnown = (/** @type {any} */ _, /** @type {number} */ i) => counts[i] > 0;
+    return { goals: goals.filter(isKnown), visits: counts.filter(isKnown), way, verified: verified.data[this.at(seed, task, episode)] };
+  }
+
+  /**
+   * What is known of the order after an episode.
+   * @param {number} seed @param {number} task @param {number} episode
+   * @returns {{ confirmed: Goal[], excluded: Goal[], isComplete: boolean }}
+   */
+  order(seed, task, episode) {
+    const { prefix, excluded, complete } = this.arrays, at = this.at(seed, task, episode), goals = this.found(seed, task);
+    const places = prefix.shape[3], row = Array.from(prefix.data.subarray(at * places, (at + 1) * places));
+    const out = excluded.data.subarray(at * excluded.shape[3]);
+    return {
+      confirmed: row.filter((place) => place > 0).map((place) => goals[place - 1]),
+      excluded: goals.filter((_, i) => out[i]),
+      isComplete: Boolean(complete.data[at]),
+    };
+  }
+
+  /**
+   * The best tried prompts after an episode with the posterior of their mean returns, the best first.
+   * @param {number} seed @param {number} task @param {number} episode
+   * @returns {{ goals: Goal[], first: number, tries: number, mean: number, std: number }[]}
+   */
+  worths(seed, task, episode) {
+    const { worthEpisode, worthMean, worthStd } = this.arrays, num = worthEpisode.shape[3], at = this.at(seed, task, episode) * num;
+    const prompt = (/** @type {number} */ e) => this.ofRound("choice", seed, task, e);
+    return range(num).filter((i) => worthEpisode.data[at + i]).map((i) => {
+      const first = worthEpisode.data[at + i] - 1, tries = range(episode + 1).filter((e) => prompt(e) === prompt(first)).length;
+      return { goals: this.prompt(prompt(first)), first, tries, mean: worthMean.data[at + i], std: worthStd.data[at + i] };
     });
   }
 

@@ -3,6 +3,7 @@
 import { mean, range } from "./arrays.js";
 import { chartWidth, curves, scale, ticks } from "./chart.js";
 import { byId, drawScene, element, fill, legendOf, onScheme, svg } from "./dom.js";
+import { hasKnown, knownTitle, showKnown } from "./known.js";
 import { Log } from "./log.js";
 
 /**
@@ -15,7 +16,7 @@ import { Log } from "./log.js";
 const SOLVED = 1e-4; // a smaller regret counts as an optimal solution
 const PLAY_MS = 450;
 
-/** Names for goals: the world's, those of its parts, or its numbers. @type {(world: WorldPage | null, data: WorldData) => (goal: Goal) => string} */
+/** Names for goals: the world's, those of its parts, or its numbers. @type {(world: WorldDrawing | null, data: WorldData) => (goal: Goal) => string} */
 function goalNamer(world, { facts, parts }) {
   if (world) return (goal) => world.goalName(facts, goal);
   if (parts.length)
@@ -56,7 +57,7 @@ function seriesOf(log, index) {
 }
 
 class Report {
-  /** @param {WorldPage | null} world @param {ReportData} data @param {Log[]} logs */
+  /** @param {WorldDrawing | null} world @param {ReportData} data @param {Log[]} logs */
   constructor(world, data, logs) {
     this.world = world;
     this.data = data;
@@ -73,8 +74,15 @@ class Report {
     return this.logs[this.place.run];
   }
 
+  /** Whether episodes of the run can be drawn. */
   get canDraw() {
-    return Boolean(this.world) && this.log.hasActions;
+    return Boolean(this.world) && (this.log.hasActions || this.log.hasTracks);
+  }
+
+  /** Whether the episode that is looked at can be drawn. */
+  get isDrawn() {
+    const { log, place: { seed, task, episode } } = this;
+    return this.canDraw && (log.hasActions || log.isTracked(seed, task, episode));
   }
 
   begin() {
@@ -198,7 +206,7 @@ class Report {
       const within = /** @type {Element} */ (event.target).matches?.("input, select, .wide");
       if (by && !within && !event.altKey && !event.ctrlKey && !event.metaKey) step(by);
     });
-    if (this.world) fill(byId("legend"), ...legendOf(this.world));
+    if (this.world) fill(byId("legend"), ...legendOf(this.world.legend));
   }
 
   togglePlay() {
@@ -247,10 +255,9 @@ class Report {
     byId("shown-run").value = byId("run").value = String(this.place.run);
     fill(byId("seed"), ...range(log.numSeeds).map((seed) => element("option", { value: seed }, String(seed))));
     byId("episode").max = log.numEpisodes;
-    byId("arms-section").hidden = !log.hasArms && !log.data.note;
-    byId("visits-label").hidden = byId("legend").hidden = !this.canDraw;
-    const whole = this.data.withEpisodes ? "" : "What the episodes did is left out, since the page would be too large.";
-    byId("stage-note").textContent = whole || (this.canDraw || log.hasReached ? "" : "These results do not hold what their episodes did.");
+    byId("arms-section").hidden = !hasKnown(log) && !log.data.note;
+    byId("arms-title").textContent = knownTitle(log);
+    byId("visits-label").hidden = !this.canDraw || !log.hasActions;
     fill(byId("stage-place"), this.canDraw ? element("canvas", { class: "stage still", id: "stage", role: "img" }) : null);
     this.walks.clear();
     this.showTasks();
@@ -276,14 +283,22 @@ class Report {
       showPrompt(byId("best"), log.prompt(log.ofRound("best", seed, task, episode)), this.goalName);
     }
     fill(byId("returns"), this.returnsChart());
-    this.showArms();
     this.draw();
   }
 
-  /** The moments of an episode, played again by the rules. @param {number} episode */
+  /** What stands below the picture of the episode. */
+  stageNote() {
+    const { log } = this;
+    if (!this.data.withEpisodes) return "What the episodes did is left out, since the page would be too large.";
+    if (!this.canDraw && !log.hasReached) return "These results do not hold what their episodes did.";
+    return this.canDraw && !this.isDrawn ? `Of these results, ${log.trackStride > 1 ? `the first of every ${log.trackStride} episodes is` : "no episode is"} drawn on the map.` : "";
+  }
+
+  /** The moments of an episode, tracked or played again by the rules. @param {number} episode */
   walk(episode) {
     const { world, log, place: { task, seed } } = this, at = log.at(seed, task, episode);
-    if (!this.walks.has(at) && world) {
+    if (log.hasTracks) return world?.moments?.(log.track(seed, task, episode)) ?? [];
+    if (!this.walks.has(at) && world?.play) {
       const play = world.play(this.data.world.facts, this.data.tasks[task].task);
       play.reset(log.start(seed, task, episode));
       const moments = [play.moment()];
@@ -297,12 +312,17 @@ class Report {
   }
 
   draw() {
-    const { world, log, data, place: { task, seed, episode } } = this;
-    if (world && this.canDraw) {
+    const { world, log, data, isDrawn, place: { task, seed, episode } } = this;
+    byId("stage-note").textContent = this.stageNote();
+    byId("legend").hidden = !isDrawn;
+    if (this.canDraw) byId("stage").hidden = !isDrawn;
+    if (world && isDrawn) {
       const goals = log.hasPrompts ? log.prompt(log.ofRound("choice", seed, task, episode)) : [];
       const earlier = byId("visits").checked ? range(episode + 1).map((e) => this.walk(e)) : undefined;
       drawScene(byId("stage"), world, data.world.facts, { task: data.tasks[task].task, goals, moments: this.walk(episode), earlier });
-    } else if (log.hasReached) fill(byId("stage-place"), this.timeline());
+    }
+    fill(byId("timeline-place"), log.hasReached ? this.timeline() : null);
+    this.showKnown();
   }
 
   /** The goals that the episode reached, in the order of their steps. */
@@ -354,21 +374,13 @@ class Report {
     return element("div", {}, drawing, element("p", { class: "quiet" }, "Full: greedy. Ring: sampled. Large: this episode. Dashed: optimum. Click to choose."));
   }
 
-  showArms() {
-    const { log, place: { task, seed, episode } } = this;
-    if (!log.hasArms) return void (byId("arms").textContent = log.data.note);
-    const rows = log.arms(seed, task, episode);
-    const cells = rows.map(({ goals, pulls, mean: value, isNew, isChanged }, i) =>
-      element("tr", { class: isChanged ? "now" : null },
-        element("td", {}, `${i + 1}${isNew ? " new" : isChanged ? " acted" : ""}`), element("td", {}, goals.map(this.goalName).join(" → ")),
-        element("td", {}, String(pulls)), element("td", {}, value.toFixed(2))));
-    fill(byId("arms"), element("table", {},
-      element("thead", {}, element("tr", {}, ...["arm", "prompt", "episodes", "mean return"].map((name) => element("th", { scope: "col" }, name)))),
-      element("tbody", {}, ...cells)));
+  showKnown() {
+    const { log, world, data, goalName, place: { task, seed, episode } } = this;
+    showKnown(byId("arms"), { log, world, facts: data.world.facts, task: data.tasks[task].task, seed, number: task, episode, goalName });
   }
 }
 
-/** @param {(WorldPage | null)[]} worlds @param {ReportData} data */
+/** @param {(WorldDrawing | null)[]} worlds @param {ReportData} data */
 export async function main(worlds, data) {
   const logs = await Promise.all(data.runs.map((run) => Log.of(run)));
   new Report(worlds[0], data, logs).begin();
