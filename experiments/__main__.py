@@ -21,6 +21,7 @@ COMMANDS = {
     "plot": "draw figures of adaptations",
     "report": "show adaptations in one HTML page, down to every episode",
     "playground": "make an HTML page in which anyone leads a policy by goals",
+    "export": "write a policy as ONNX models, which run without jax",
     "reproduce": "make tables and figures of the paper",
     "release": "package a pre-training run as a released policy",
     "bench": "measure speed in CPU time",

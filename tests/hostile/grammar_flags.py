@@ -57,6 +57,7 @@ BASE: dict[str, tuple[str, tuple[str, ...]]] = {
     "plot": ("result --out new", ("result", "policy")),
     "report": ("result --out new.html", ("result",)),
     "playground": ("--policy policy --out new.html", ("policy",)),
+    "export": ("--policy policy --out new.onnx", ("policy",)),
     "reproduce": ("table4 --seeds 1 --out new", ()),
     "release": ("run --out new", ("run",)),
     "bench": ("--quick --json new.json", ()),
@@ -65,6 +66,7 @@ BASE: dict[str, tuple[str, tuple[str, ...]]] = {
 
 MAY_WRITE = (
     "new", "new.json", "new.html", "new.csv", "report.html", "playground.html", "runs", "data", "figures",
+    "new.onnx", "new_prefill.onnx", "policy.onnx", "policy_prefill.onnx",
 )  # fmt: skip
 """Where commands may write that are not refused."""
 
@@ -140,6 +142,13 @@ CONTRADICTIONS: dict[str, tuple[tuple[str, str], ...]] = {
         ("--policy result", "result"),
         ("--out new.txt", "--out"),
     ),
+    "export": (
+        ("--env gridworld", "policy"),
+        ("--policy result", "result"),
+        ("--format torch", "--format"),
+        ("--out new.txt", "--out"),
+        ("--out nowhere/new.onnx", "nowhere"),
+    ),
     "reproduce": (
         ("--only nothing", "only"),
         ("table5 --only nothing", "nothing"),
@@ -187,6 +196,7 @@ VALID: dict[str, tuple[str, ...]] = {
     "plot": ("--tasks 0", "--tasks 1 0", "--seed 0"),
     "report": ("result result/", "--env maze15"),
     "playground": ("--env=maze15", "--env maze15 maze15", "--env envs.maze:MAZE15"),
+    "export": ("--env=maze15", "--env envs.maze:MAZE15", "--format onnx"),
     "reproduce": ("table5 --only astar4", "--seeds 2", "figure8 --only 5 10"),
     "bench": ("--demonstrator astar4", "--trajectories 3"),
 }

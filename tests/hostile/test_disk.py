@@ -123,6 +123,7 @@ MAKERS = {
     "plot": "plot result --out {}",
     "report": f"report result {WORLD} --out {{}}",
     "playground": "playground --out {}",
+    "export": "export --out {}",
     "release": f"release run {WORLD} --out {{}}",
     "reproduce": f"reproduce figure8 {WORLD} --only 5 --out {{}}",
 }

@@ -44,6 +44,7 @@ PLACES: tuple[tuple[str, str, Any], ...] = (
     ("experiments.drawing", "draw_run", begin),
     ("experiments.pages.report", "_knowledge", begin),
     ("experiments.pages.playground", "half_weights", begin),
+    ("experiments.exporting", "facts_of", begin),
     ("experiments.measurements", "measurements", begin),
 )
 """Module, name in it, and what stands there instead."""

@@ -1,0 +1,88 @@
+"""Write a policy for other runtimes than jax, with all that is to be known of it."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any
+
+from envs.errors import MissingExtraError, UsageError
+from envs.registry import World
+from mgpo_jax.files import to_json, written
+from mgpo_jax.policy import LoadedPolicy
+from mgpo_jax.policy_files import load_policy
+from mgpo_jax.transformer import OBS_LIMIT, TransformerConfig
+
+KEY = "mgpo_jax"  # of the facts in the metadata of a model
+INSTALL = 'pip install -e ".[onnx]"'
+
+
+def check_extra() -> None:
+    """Raise ``MissingExtraError`` if onnx is not installed; imports nothing of it."""
+    if importlib.util.find_spec("onnx") is None:
+        raise MissingExtraError(f"an export needs the package onnx: {INSTALL}")
+
+
+def check_exportable(config: TransformerConfig, name: str) -> None:
+    """Raise ``UsageError`` for a network that there is no graph for."""
+    if config.head != "categorical" or config.encoder != "linear":
+        raise UsageError(
+            f"the policy of {name} has the head {config.head} and the encoder {config.encoder}; an export "
+            "needs categorical and linear"
+        )
+
+
+def prefill_path(out: Path) -> Path:
+    """Where the model that reads the prompt lies, beside that of a step."""
+    return out.with_name(f"{out.stem}_prefill{out.suffix}")
+
+
+def export_onnx(world: World, policy_folder: Path | None, out: Path) -> None:
+    """Write the released policy of a world, or the one in a folder, as two ONNX files.
+
+    Raises:
+      UsageError: if there is no such policy, or no graph for its network.
+      DataError: if the policy is damaged or does not fit the world.
+      MissingExtraError: if onnx is not installed.
+    """
+    policy = load_policy(world, policy_folder)
+    check_exportable(policy.config, world.name)
+    facts = {KEY: json.dumps(facts_of(world, policy), allow_nan=False)}
+    check_extra()
+    from experiments.onnx_graphs import prefill_graph, step_graph
+
+    for path, make in ((prefill_path(out), prefill_graph), (out, step_graph)):
+        with written(path) as partial:
+            partial.write_bytes(make(policy, facts).SerializeToString())
+
+
+def facts_of(world: World, policy: LoadedPolicy) -> dict[str, Any]:
+    """What a program that runs the models has to know, as JSON values."""
+    config, spec = policy.config, world.make().spec
+    return {
+        "world": world.name,
+        "spec": {
+            "obs_shape": list(spec.obs.shape),
+            "obs_dtype": str(spec.obs.dtype),
+            "goal_dim": spec.goal_dim,
+            "num_actions": spec.action_dim,
+            "horizon": spec.horizon,
+        },
+        "network": to_json(
+            {
+                "max_prompt_length": config.max_prompt_length,
+                "tokens_per_step": config.tokens_per_step,
+                "num_layers": config.num_layers,
+                "num_heads": config.num_heads,
+                "embed_dim": config.embed_dim,
+            }
+        ),
+        # The models do this themselves.
+        "standardization": {
+            "mean": list(config.obs_mean),
+            "std": list(config.obs_std),
+            "limit": OBS_LIMIT,
+        },
+        "weights_sha256": policy.sha256,
+    }
