@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Array
 
-from envs.base import Task
+from envs.base import State, Task
 
 Json = Any
 
@@ -30,6 +31,10 @@ class Page:
         playground, and draws it. It imports nothing.
       facts: what the script has to know of this world, such as its size.
       task: what the script has to know of one task, which has numpy leaves.
+      track: ``(state) -> integers [D]`` from 0 to 255, for a world whose rules cannot be in the script,
+        since chance decides in it: what the drawing has to know of each moment of an episode, such as where
+        the agent is, in terms of ``jax.numpy``. Saved episodes are played again in jax, and the script
+        makes of these numbers what it draws (``moments``). Such a world has no playground.
       start: ``(obs) -> integers``, what the script has to know of the first observation of an episode,
         where episodes do not start alike.
       describe: one task in a few words.
@@ -39,6 +44,7 @@ class Page:
     script: Path | None = None
     facts: Mapping[str, Json] = field(default_factory=dict)
     task: Callable[[Task], Json] | None = None
+    track: Callable[[State], Array] | None = None
     start: Callable[[np.ndarray], list[int]] | None = None
     describe: Callable[[Task], str] | None = None
     parts: Sequence[str] = ()

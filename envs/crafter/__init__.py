@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from envs.base import Demonstrator, ObsLayout
     from envs.crafter.env import Crafter
     from envs.drawing import Pictures
+    from envs.page import Page
 
 __all__ = [
     "CRAFTER",
@@ -57,6 +58,12 @@ def load_pictures(env: Crafter) -> Pictures:
     from envs.crafter.pictures import crafter_pictures
 
     return crafter_pictures(env)
+
+
+def load_page(env: Crafter) -> Page:
+    from envs.crafter.page import crafter_page
+
+    return crafter_page(env)
 
 
 def make_encoder(obs_shape: tuple[int, ...], width: int, layout: ObsLayout | None) -> Module:
@@ -107,6 +114,7 @@ CRAFTER_SYMBOLIC = World(
     demonstrators=load_demonstrators,
     presets={name: {**preset, "encoder": "cells"} for name, preset in PRESETS.items()},
     pictures=load_pictures,
+    page=load_page,
     # Greedy actions repeat themselves and get stuck. Returns vary with what mobs do.
     judged=Judgement(mode="sample", temperature=1.0, episodes=16),
     # About the standard deviation of the returns of one prompt. The default unit, the range of all returns

@@ -170,13 +170,14 @@ def color_of(goal: int) -> str:
 
 def map_picture(task: CrafterTask) -> UInt8[np.ndarray, "height width 3"]:
     """The whole world of a task as it is at the start, 16 pixels a cell."""
-    blocks = np.asarray(_blocks(jnp.asarray(task.seed, jnp.uint32)))
+    blocks = np.asarray(blocks_of(jnp.asarray(task.seed, jnp.uint32)))
     cells = tiles(UNIT).day[blocks]
     return cells.swapaxes(1, 2).reshape(SIDE * UNIT, SIDE * UNIT, 3)
 
 
 @jax.jit
-def _blocks(seed: UInt32[Array, ""]) -> Int[Array, "64 64"]:
+def blocks_of(seed: UInt32[Array, ""]) -> Int[Array, "64 64"]:
+    """The blocks of the world of a seed at its start."""
     return new_world(seed).map
 
 

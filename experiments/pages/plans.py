@@ -71,6 +71,9 @@ def plan_of(results: Results) -> Arrays:
     if found is None:
         return {}
     adapter, state = found
+    models = MapState, OrderState, WorthState
+    if isinstance(state, models) and results.episodes_used is not None:
+        raise DataError("what a plan knew is not shown of searches that ended early (--stop-at)")
     if isinstance(state, MapState):
         return _map_of(results, adapter)
     if isinstance(state, OrderState):
@@ -81,7 +84,7 @@ def plan_of(results: Results) -> Arrays:
 def _map_of(results: Results, adapter: Adapter) -> Arrays:
     if results.actions is None:
         raise DataError("these results hold no actions, from which a map could be drawn again")
-    spec = results.world.make().spec
+    spec = results.environment.spec
 
     def read(state: MapState) -> Any:
         key = jax.random.key(
@@ -134,7 +137,7 @@ def _order_of(results: Results, adapter: Adapter) -> Arrays:
     (goals, size), (prefix, excluded, complete, best) = _tell(
         results, adapter, read, lambda state: (state.order.goals, state.order.size)
     )
-    if results.world.make().spec.deterministic:
+    if results.environment.spec.deterministic:
         fits = _same_prompts(best, results)  # the best of the greedy episodes
     else:
         fits = _follows(results, goals, prefix, complete)
@@ -172,7 +175,7 @@ def _follows(
 
 
 def _worth_of(results: Results, adapter: Adapter) -> Arrays:
-    spec = results.world.make().spec
+    spec = results.environment.spec
 
     def read(state: WorthState) -> Any:
         if spec.deterministic:
@@ -278,7 +281,7 @@ def _tell(
 
 def _player(results: Results) -> Callable[[int], Episode]:
     """Plays the episodes ``[S, E]`` of a task again, or puts them together from the goals reached."""
-    env = results.world.make()
+    env = results.environment
     actions = results.actions
     if actions is None or actions.dtype.kind == "f":
         return lambda task: _rewarded_in_order(results, env.spec, task)

@@ -42,7 +42,7 @@ def playground(worlds: Sequence[World], policy: Path | None = None) -> str:
 def world_data(world: World, policy: LoadedPolicy) -> dict[str, Any]:
     """What the page has to know of one world and its policy, as JSON values."""
     page, spec, network = page_of(world), world.make().spec, policy.config
-    if page.script is None:
+    if page.script is None or page.track is not None:
         raise UsageError(
             f"{world.name} has no rules for a page, so that no playground can be made of it"
         )

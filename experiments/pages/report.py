@@ -21,6 +21,7 @@ from experiments.pages.build import SCRIPTS, html, script_of
 from experiments.pages.knowledge import knowledge_of
 from experiments.pages.packing import packed, smallest
 from experiments.pages.plans import plan_of
+from experiments.pages.tracks import tracks_of
 from experiments.pages.worlds import page_of, tasks_in_page
 from experiments.store.layout import META
 from experiments.store.paper import paper_final
@@ -179,7 +180,8 @@ def _arrays_of(results: Results, page: Page, with_episodes: bool) -> dict[str, n
         "evalEpisodes": results.eval_episodes.astype(np.uint32),
         "evalReturns": results.eval_returns.astype(np.float32),
     }
-    reached = results.reached if with_episodes and page.script is None else None
+    has_rules = page.script is not None and page.track is None
+    reached = results.reached if with_episodes and not has_rules else None
     goals = [np.zeros((0, results.task_goals.shape[1]), np.float32)]
     if "prompt.goals" in results.choices:
         goals += [
@@ -197,7 +199,7 @@ def _arrays_of(results: Results, page: Page, with_episodes: bool) -> dict[str, n
         arrays["reachedSteps"] = smallest(reached.steps)
         arrays["reachedGoals"] = smallest(parts[-1])
     if with_episodes:
-        arrays |= _actions(results, page)
+        arrays |= _actions(results, page) if has_rules else tracks_of(results, page)
     return arrays
 
 
@@ -246,7 +248,7 @@ def _actions(results: Results, page: Page) -> dict[str, np.ndarray]:
     """
     actions = results.actions
     noisy = results.environment != results.world.make()
-    if page.script is None or actions is None or actions.dtype.kind == "f" or noisy:
+    if actions is None or actions.dtype.kind == "f" or noisy:
         return {}
     real = actions != np.iinfo(actions.dtype).max
     found = {"lengths": smallest(real.sum(axis=-1)), "actions": smallest(actions[real])}

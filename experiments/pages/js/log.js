@@ -29,8 +29,7 @@ export class Log {
     if (this.hasPrompts) arrays.choice.data = decodeNew(arrays.choice.data);
     this.hasReached = Boolean(arrays.reachedCounts);
     this.actionsFrom = this.hasActions ? sums(arrays.lengths.data) : new Uint32Array(0);
-    // Of how many episodes one is tracked, the first of a search among them.
-    this.trackStride = this.hasTracks ? range(numEpisodes).findIndex((e) => e > 0 && arrays.trackCounts.data[e] > 0) : 0;
+    this.trackStride = this.hasTracks ? arrays.trackStride.data[0] : 0;
     this.trackFrom = this.hasTracks ? sums(arrays.trackCounts.data) : new Uint32Array(0);
     this.waysFrom = this.hasMap ? sums(arrays.wayCounts.data.map((/** @type {number} */ count) => Math.max(count - 1, 0))) : new Uint32Array(0);
     this.reachedFrom = this.hasReached ? sums(arrays.reachedCounts.data) : new Uint32Array(0);

@@ -291,7 +291,9 @@ class Report {
     const { log } = this;
     if (!this.data.withEpisodes) return "What the episodes did is left out, since the page would be too large.";
     if (!this.canDraw && !log.hasReached) return "These results do not hold what their episodes did.";
-    return this.canDraw && !this.isDrawn ? `Of these results, ${log.trackStride > 1 ? `the first of every ${log.trackStride} episodes is` : "no episode is"} drawn on the map.` : "";
+    if (!this.canDraw || this.isDrawn) return "";
+    if (this.place.episode % log.trackStride === 0) return "Not drawn on the map: played again, this episode does not come to what is on record.";
+    return `Not drawn on the map, as only the first of every ${log.trackStride} episodes is.`;
   }
 
   /** The moments of an episode, tracked or played again by the rules. @param {number} episode */
@@ -330,7 +332,8 @@ class Report {
     const { log, place: { task, seed, episode } } = this, reached = log.reached(seed, task, episode);
     const names = [...new Set([...this.data.world.parts, ...reached.map(({ goal }) => this.goalName(goal))])].slice(0, 40);
     const last = Math.max(1, ...range(log.numEpisodes).flatMap((e) => log.reached(seed, task, e).map(({ step }) => step)));
-    const width = chartWidth(640), left = 120, row = 34, x = scale(0, last, left, width - 24), height = row * names.length + 34;
+    const width = chartWidth(640), longest = Math.max(0, ...names.map((name) => Math.min(name.length, 22)));
+    const left = Math.max(60, 20 + 7.6 * longest), row = 34, x = scale(0, last, left, width - 24), height = row * names.length + 34;
     const text = reached.map(({ step, goal }) => `${this.goalName(goal)} in step ${step}`).join(", ") || "no goal was reached";
     return svg("svg", { viewBox: `0 0 ${width} ${height}`, class: "chart timeline", role: "img", "aria-label": `Goals reached: ${text}` },
       ...names.flatMap((name, i) => [
