@@ -214,7 +214,7 @@ def _rows_of(part: Arrays, where: tuple[int, int]) -> np.ndarray:
     return np.concatenate([np.where(mask, goals, 0), mask], axis=-1).reshape(len(goals), -1)
 
 
-def _same_prompts(found: Prompt, results: Results) -> np.ndarray:
+def _same_prompts(found: Any, results: Results) -> np.ndarray:
     """``[S, N, E]``: which prompts are the best ones on record."""
     goals, mask = results.best["prompt.goals"], results.best["prompt.mask"]
     same_goals = np.where(mask[..., None], found.goals == goals, True).all(axis=(-1, -2))

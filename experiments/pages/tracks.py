@@ -51,9 +51,9 @@ def tracks_of(results: Results, page: Page) -> dict[str, np.ndarray]:
       or the results hold no actions, and behind noise.
     """
     actions, keys = results.actions, results.keys
-    if results.environment != results.world.make():
-        return {}
     if page.track is None or actions is None or actions.dtype.kind == "f":
+        return {}
+    if results.environment != results.world.make():
         return {}
     lengths = (actions != np.iinfo(actions.dtype).max).sum(axis=-1, dtype=np.int32)
     if keys is None:
