@@ -1,43 +1,44 @@
 """Trajectories on disk and in memory, and the batches that pre-training draws from them.
 
-On disk a dataset is a folder with ``trajectories.npz`` (ragged arrays concatenated over time, with the
-length of each trajectory) and ``manifest.json`` (what it is, how it was made, its hash).
+On disk a dataset is a folder with ragged arrays, concatenated over time, the length of each trajectory,
+and ``manifest.json`` (what it is, how it was made, its hash). The arrays are packed in
+``trajectories.npz``, or are files of their own that are mapped into memory (``manifest``).
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from annotated_types import Ge, Le
-from pydantic import BaseModel
 
-from envs.base import EnvSpec, Trajectory
+from envs.base import ArraySpec, Box, Discrete, EnvSpec, Trajectory
 from envs.errors import DataError, shown
 from envs.registry import WORLDS
 from mgpo_jax.files import hash_file, new_folder, write_arrays, write_json
-from mgpo_jax.schema import (
-    STRICT,
-    ArrayField,
-    DemonstratorName,
-    Json,
-    Name,
-    Sha256,
-    Sizes,
-    checked_entry,
-    fitted_arrays,
-    read_arrays,
-    read_document,
+from mgpo_jax.manifest import (
+    ARRAYS,
+    MANIFEST,
+    MAPPED,
+    PACKED,
+    Facts,
+    Manifest,
+    hash_of_files,
+    mend_for,
+    read_manifest,
 )
-from mgpo_jax.settings import Count, Index, Seed
+from mgpo_jax.schema import (
+    ArrayField,
+    Sizes,
+    fitted_arrays,
+    let_go,
+    mapped_arrays,
+    read_arrays,
+)
 
-FORMAT = 2  # 1 had neither rewards nor last observations, and called achieved goals "goals"
-ARRAYS = "trajectories.npz"
-MANIFEST = "manifest.json"
 SIZES: Sizes = {"trajectory": range(1, 2**31), "step": range(1, 2**31)}
 STEP_ARRAYS = tuple(name for name in Trajectory._fields if name != "length")
 """Those with a row for every step, of trajectories; datasets have ``rewards`` beside them."""
@@ -58,6 +59,8 @@ class Dataset:
     rewards: np.ndarray | None = None  # [total] float32
     last_obs: np.ndarray | None = None  # [N, ...], the observation after the last action
     variants: np.ndarray | None = None  # [N] int32, of the world; the manifest names them in order
+    terminated: np.ndarray | None = None  # [N] bool, whether the last step ended the task
+    truncated: np.ndarray | None = None  # [N] bool, whether the last step was cut off
 
     @property
     def starts(self) -> np.ndarray:
@@ -94,6 +97,8 @@ class Dataset:
             return np.where(mask, steps[rows], np.zeros((), steps.dtype))
 
         arrays = {name: padded(self.arrays[name]) for name in STEP_ARRAYS if name in self.arrays}
+        for name in arrays:
+            let_go(self.arrays[name])
         length: Any = lengths.astype(np.int32)  # numpy arrays go where jax's do
         return Trajectory(**arrays, length=length)
 
@@ -104,17 +109,33 @@ def hash_task(fingerprint: np.ndarray) -> np.uint64:
     return np.frombuffer(digest.digest(), np.uint64)[0]
 
 
-def save_dataset(folder: Path, dataset: Dataset, manifest: dict[str, Any]) -> None:
-    """Write a dataset; the folder appears only when it is complete."""
+def save_dataset(
+    folder: Path, dataset: Dataset, manifest: dict[str, Any], mapped: bool = False
+) -> None:
+    """Write a dataset; the folder appears only when it is complete.
+
+    Args:
+      folder: where to; it must not exist.
+      dataset: the trajectories.
+      manifest: what else is to be known of them.
+      mapped: write a file for each array, uncompressed, which a training then maps into memory.
+    """
     with new_folder(Path(folder)) as place:
-        write_dataset(place, dataset, manifest)
+        write_dataset(place, dataset, manifest, mapped)
 
 
-def write_dataset(place: Path, dataset: Dataset, manifest: dict[str, Any]) -> None:
+def write_dataset(
+    place: Path, dataset: Dataset, manifest: dict[str, Any], mapped: bool = False
+) -> None:
     """Write the files of a dataset into a folder."""
+    if mapped:
+        for name, array in dataset.arrays.items():
+            np.save(place / f"{name}.npy", array, allow_pickle=False)
+        finish_mapped(place, dataset.arrays, len(dataset), len(dataset.actions), manifest)
+        return
     write_arrays(place / ARRAYS, dataset.arrays)
     facts = {
-        "format": FORMAT,
+        "format": PACKED,
         "sha256": hash_file(place / ARRAYS),
         "num_trajectories": len(dataset),
         "num_steps": int(dataset.lengths.sum()),
@@ -122,63 +143,97 @@ def write_dataset(place: Path, dataset: Dataset, manifest: dict[str, Any]) -> No
     write_json(place / MANIFEST, {**facts, **manifest})
 
 
-class _Manifest(BaseModel):
-    """What is known of the entries of ``manifest.json``; there may be others."""
-
-    model_config = {**STRICT, "extra": "ignore"}
-
-    format: int
-    sha256: Sha256
-    num_trajectories: Count = 0
-    num_steps: Count = 0
-    """0 where the manifest does not say."""
-    env: Name | None = None
-    policy: DemonstratorName | None = None
-    settings: dict[str, Json] = {}
-    seed: Seed | None = None
-    versions: dict[str, str] = {}
-    tried_again: Index = 0
-    failed_episodes: Index = 0
-    dropped_test_tasks: Index = 0
-    length: dict[str, Json] = {}
-    at_horizon: Annotated[float, Ge(0), Le(1)] = 0
-    hindsight_return: dict[str, Json] = {}
-    variants: dict[str, Index] = {}
-    """How many trajectories each variant of the world has, by its name, in the order of their indices."""
+def finish_mapped(
+    place: Path, names: Iterable[str], num_trajectories: int, num_steps: int, manifest: Any
+) -> None:
+    """Write the manifest of a dataset whose arrays lie in files ``NAME.npy`` of a folder already."""
+    files = {name: hash_file(place / f"{name}.npy") for name in names}
+    facts = {
+        "format": MAPPED,
+        "sha256": hash_of_files(files),
+        "num_trajectories": num_trajectories,
+        "num_steps": num_steps,
+        "files": files,
+    }
+    write_json(place / MANIFEST, {**facts, **manifest})
 
 
 def load_dataset(
-    folder: Path, spec: EnvSpec | None = None, made: Mapping[str, Any] | None = None
+    folder: Path,
+    spec: EnvSpec | None = None,
+    made: Mapping[str, Any] | None = None,
+    any_value: bool = False,
 ) -> tuple[Dataset, dict[str, Any]]:
-    """Read a dataset and its manifest.
+    """Read a dataset and its manifest; one whose arrays have files of their own is mapped into memory.
 
     Args:
       folder: where ``save_dataset`` wrote it.
       spec: the world it must fit.
       made: what must not be contradicted by the manifest, such as ``env``, ``policy``, ``seed`` and
         ``num_trajectories``.
+      any_value: let NaN, infinity and actions out of range pass, for those who look for them.
 
     Raises:
       DataError: if it is missing, damaged, holds NaN or belongs to another world.
     """
     folder = Path(folder)
-    path, mend = folder / ARRAYS, f"remove {folder} and collect it again"
-    if not (folder / MANIFEST).is_file():
-        raise DataError(f"no dataset in {folder} ({MANIFEST} is missing); {mend}")
-    document, manifest = _read_manifest(folder / MANIFEST, made or {}, mend)
-    if not path.is_file() or hash_file(path) != manifest.sha256:
-        raise DataError(f"{path} is missing or differs from the hash in its manifest; {mend}")
+    mend = mend_for(folder)
+    document, manifest = read_manifest(folder, mend)
+    _check_made(document, made or {}, folder / MANIFEST, mend)
     fields = _fields(spec)
     if manifest.format == 1:
         fields["goals"] = fields.pop("achieved_goals")
+    if any_value:
+        fields = {
+            name: replace(field, any_value=name != "lengths") for name, field in fields.items()
+        }
     counted = {"trajectory": manifest.num_trajectories, "step": manifest.num_steps}
-    sizes = {axis: size for axis, size in counted.items() if size}
-    arrays = read_arrays(path, fields, {**SIZES, **sizes}, mend)
+    sizes = {**SIZES, **{axis: size for axis, size in counted.items() if size}}
+    where = folder if manifest.format == MAPPED else folder / ARRAYS
+    if manifest.format == MAPPED:
+        arrays = _mapped(folder, fields, sizes, manifest, mend)
+    else:
+        if not where.is_file() or hash_file(where) != manifest.sha256:
+            raise DataError(f"{where} is missing or differs from the hash in its manifest; {mend}")
+        arrays = read_arrays(where, fields, sizes, mend)
     if manifest.format == 1:
         arrays["achieved_goals"] = arrays.pop("goals")
     dataset = Dataset(**arrays)
-    _check_lengths(dataset, path, mend)
+    _check_lengths(dataset, where, mend)
     return dataset, document
+
+
+def _mapped(
+    folder: Path, fields: Mapping[str, ArrayField], sizes: Sizes, manifest: Manifest, mend: str
+) -> dict[str, np.ndarray]:
+    """The arrays of a mapped dataset, whose hashes are those of its manifest."""
+    for name, sha256 in manifest.files.items():
+        path = folder / f"{name}.npy"
+        if not path.is_file() or hash_file(path) != sha256:
+            raise DataError(f"{path} is missing or differs from the hash in its manifest; {mend}")
+    listed = {name: f for name, f in fields.items() if f.required or name in manifest.files}
+    arrays = mapped_arrays(folder, listed, sizes, mend)
+    # Arrays that every batch looks at are small, and are read.
+    for name in {"lengths", "task_hashes", "variants", "terminated", "truncated"} & arrays.keys():
+        arrays[name] = np.array(arrays[name])
+    return arrays
+
+
+def spec_of(facts: Facts) -> EnvSpec:
+    """The world that logs are from, as their manifest and their arrays tell it; it has no rewards.
+
+    A policy that is trained on them can be loaded and can act, but there is nothing to evaluate it in.
+    """
+    num = facts.num_actions
+    return EnvSpec(
+        name=facts.spec.name,
+        obs=ArraySpec(facts.obs_shape, facts.obs_dtype),
+        goal_dim=facts.goal_dim,
+        actions=Box(facts.action_dim) if num is None else Discrete(num),
+        horizon=facts.spec.horizon,
+        return_range=(0.0, 1.0),
+        truncate_in_hindsight=facts.spec.truncate_in_hindsight,
+    )
 
 
 def variant_counts(folder: Path, sha256: str) -> dict[str, int]:
@@ -191,28 +246,20 @@ def variant_counts(folder: Path, sha256: str) -> dict[str, int]:
     Raises:
       DataError: if the manifest is damaged.
     """
-    path = Path(folder) / MANIFEST
-    if not path.is_file():
+    if not (Path(folder) / MANIFEST).is_file():
         return {}
-    _, manifest = _read_manifest(path, {}, f"remove {folder} and collect it again")
+    _, manifest = read_manifest(folder)
     return manifest.variants if manifest.sha256 == sha256 else {}
 
 
-def _read_manifest(
-    path: Path, made: Mapping[str, Any], mend: str
-) -> tuple[dict[str, Any], _Manifest]:
-    """The manifest of a dataset, as it is and as far as it is known."""
-    document = read_document(path, dict[str, Json], mend)
-    manifest: _Manifest = checked_entry(document, _Manifest, path, "", mend)
-    if manifest.format not in (1, FORMAT):
-        raise DataError(
-            f"{path} has format {manifest.format}, this version reads 1 and {FORMAT}; {mend}"
-        )
+def _check_made(
+    document: Mapping[str, Any], made: Mapping[str, Any], path: Path, mend: str
+) -> None:
+    """Raise ``DataError`` for the first entry of a manifest that contradicts what is wanted."""
     for name, wanted in made.items():
         found = document.get(name, wanted)
         if found != wanted and not (name == "env" and found and _same_data(found, wanted, path)):
             raise DataError(f"{path}: {name} is {shown(found)}, wanted {shown(wanted)}; {mend}")
-    return document, manifest
 
 
 def _same_data(first: str, second: str, where: Path) -> bool:
@@ -250,6 +297,8 @@ def _fields(spec: EnvSpec | None) -> dict[str, ArrayField]:
         "rewards": ArrayField(("step",), "float32", required=False),
         "last_obs": replace(obs, shape=("trajectory", *obs.shape[1:]), required=False),
         "variants": ArrayField(("trajectory",), "int32", low=0, required=False),
+        "terminated": ArrayField(("trajectory",), "bool", required=False),
+        "truncated": ArrayField(("trajectory",), "bool", required=False),
     }
 
 

@@ -8,6 +8,7 @@ number, ``"1"`` is no integer, and NaN and infinity are never allowed.
 ``read_arrays`` reads all such files but those of ``journal``, which hold their own hash. It compares what
 the headers claim with what is declared and with the size of the file before it allocates any memory, runs
 nothing that a file holds, and converts what is valid but foreign, such as big-endian numbers.
+``mapped_arrays`` does the same for arrays in npy files, which it maps into memory as they are.
 """
 
 from __future__ import annotations
@@ -15,11 +16,13 @@ from __future__ import annotations
 import ast
 import json
 import math
+import mmap
+import os
 import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -325,6 +328,120 @@ def array_names(path: Path, mend: str = "") -> list[str]:
         return list(_members(archive))
 
 
+def array_headers(path: Path, mend: str = "") -> dict[str, ArrayHeader]:
+    """Shapes and dtypes of the arrays in an npz file, without reading them.
+
+    Raises:
+      DataError: if it is missing, no npz file, or an array cannot be as large as it claims.
+    """
+    with _opened(path, mend) as archive:
+        members = _members(archive)
+        headers = {name: _header(archive, name, info) for name, info in members.items()}
+        _check_claims(headers, members)
+        return headers
+
+
+def mapped_headers(folder: Path, names: Iterable[str], mend: str = "") -> dict[str, ArrayHeader]:
+    """Shapes and dtypes of the arrays in the files ``NAME.npy`` of a folder, without reading them.
+
+    Raises:
+      DataError: if one is missing, no npy file, or has another size than its header claims.
+    """
+    found = {}
+    for name in names:
+        path = folder / f"{name}.npy"
+        try:
+            with open(path, "rb") as file:
+                header = _read_header(path.name, file)
+                held = os.fstat(file.fileno()).st_size - header.offset
+            if header.size * header.dtype.itemsize != held:
+                raise _FaultError(
+                    f" claims shape {list(header.shape)} of {header.dtype}, the file has {held} bytes of it"
+                )
+        except FileNotFoundError:
+            raise DataError(f"{path} is missing{_tail(mend)}") from None
+        except OSError as error:
+            raise DataError(f"{path} cannot be read ({error.strerror}){_tail(mend)}") from None
+        except _FaultError as fault_:
+            raise DataError(f"{path}{fault_}{_tail(mend)}") from None
+        found[name] = header
+    return found
+
+
+def mapped_arrays(
+    folder: Path,
+    fields: Mapping[str, ArrayField],
+    sizes: Sizes | None = None,
+    mend: str = "",
+) -> dict[str, np.ndarray]:
+    """Arrays in the files ``NAME.npy`` of a folder, as their fields say, mapped into memory to read.
+
+    Nothing is converted, so dtypes have to be those of the fields. Values are checked piece by piece, and
+    what was looked at does not stay in memory. An empty array is none that can be mapped, and is made.
+
+    Args:
+      folder: where the files lie.
+      fields: what is wanted, by name. Those that are not required may be missing.
+      sizes: what is known of the sizes of axes.
+      mend: what mends a file that is not as it should be, the end of the message.
+
+    Raises:
+      DataError: if a file is missing or damaged, or an array differs from its field.
+    """
+    there = [name for name, f in fields.items() if f.required or _npy(folder, name).is_file()]
+    headers = mapped_headers(folder, there, mend)
+    found = {}
+    try:
+        _check_kinds(headers, fields)
+        _check_shapes(headers, fields, sizes or {})
+        for name, header in headers.items():
+            if header.fortran or header.dtype != fields[name].target(header.dtype):
+                raise _FaultError(f": {name} has the dtype or order {header.dtype}, not its own")
+            place = _npy(folder, name)
+            array = (
+                np.memmap(place, header.dtype, "r", header.offset, header.shape)
+                if header.size
+                else np.zeros(header.shape, header.dtype)
+            )
+            _check_pieces(array, name, header, fields[name])
+            found[name] = array
+    except _FaultError as fault_:
+        raise DataError(f"{folder}{fault_}{_tail(mend)}") from None
+    return found
+
+
+def _npy(folder: Path, name: str) -> Path:
+    return folder / f"{name}.npy"
+
+
+def _check_pieces(array: np.ndarray, name: str, header: ArrayHeader, field: ArrayField) -> None:
+    """``_check_values`` of all of an array, of which little is in memory at a time."""
+    if field.any_value or header.dtype.kind == "b":
+        return
+    flat = array.reshape(-1)
+    step = max(1, 16 * CHUNK // header.dtype.itemsize)
+    for first in range(0, len(flat), step):
+        _check_values(flat[first : first + step], name, header, field, first)
+        let_go(array)
+
+
+RESIDENT = 64 << 20
+"""Bytes of a mapped array that may stay in memory."""
+
+
+def let_go(array: np.ndarray) -> None:
+    """Take what was read of a large mapped array out of the process's memory.
+
+    It stays in the kernel's cache as long as there is room, so that reading it again is cheap. Without
+    this, a process seems to grow by every page that it has ever looked at.
+    """
+    base: Any = array
+    while isinstance(base, np.ndarray):
+        base = base.base
+    if isinstance(base, mmap.mmap) and len(base) > RESIDENT and hasattr(mmap, "MADV_DONTNEED"):
+        base.madvise(mmap.MADV_DONTNEED)
+
+
 def read_arrays(
     path: Path,
     fields: Mapping[str, ArrayField],
@@ -383,7 +500,7 @@ def fitted_arrays(
         _check_kinds(headers, fields)
         _check_shapes(headers, fields, sizes or {})
         for name, header in headers.items():
-            _check_values(arrays[name].reshape(-1), name, header, fields[name])
+            _check_pieces(arrays[name], name, header, fields[name])
     except _FaultError as fault_:
         raise DataError(f"{where}{fault_}{_tail(mend)}") from None
     return {
@@ -434,17 +551,21 @@ def _header(archive: zipfile.ZipFile, name: str, info: zipfile.ZipInfo) -> Array
         raise _damaged(name, f"has the unknown compression method {info.compress_type}")
     try:
         with archive.open(info) as file:
-            start = file.read(8)
-            if start[:6] != b"\x93NUMPY":
-                raise _damaged(name, "is no array")
-            width = {1: 2, 2: 4, 3: 4}.get(start[6], 0)
-            length = int.from_bytes(file.read(width), "little")
-            if not width or length > MAX_HEADER:
-                raise _damaged(name, "has a damaged header")
-            text = file.read(length)
+            return _read_header(name, file)
     except _UNREADABLE:
         raise _damaged(name, "is damaged") from None
-    return _parsed_header(name, text, 8 + width + length)
+
+
+def _read_header(name: str, file: Any) -> ArrayHeader:
+    """What the first bytes of an array in the format npy say of it."""
+    start = file.read(8)
+    if start[:6] != b"\x93NUMPY":
+        raise _damaged(name, "is no array")
+    width = {1: 2, 2: 4, 3: 4}.get(start[6], 0) if len(start) == 8 else 0
+    length = int.from_bytes(file.read(width), "little")
+    if not width or length > MAX_HEADER:
+        raise _damaged(name, "has a damaged header")
+    return _parsed_header(name, file.read(length), 8 + width + length)
 
 
 def _parsed_header(name: str, text: bytes, offset: int) -> ArrayHeader:

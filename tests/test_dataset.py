@@ -14,6 +14,7 @@ from scipy import stats
 
 from envs.base import ArraySpec, Box, Discrete, EnvSpec
 from envs.errors import DataError
+from mgpo_jax import schema
 from mgpo_jax.dataset import (
     ARRAYS,
     MANIFEST,
@@ -23,8 +24,10 @@ from mgpo_jax.dataset import (
     load_dataset,
     plan_batches,
     save_dataset,
+    spec_of,
 )
 from mgpo_jax.files import hash_file
+from mgpo_jax.manifest import hash_of_files, read_facts
 
 SPEC = EnvSpec(
     name="toy",
@@ -286,7 +289,7 @@ FILE_DAMAGE = {
         lambda f: (f / MANIFEST).write_bytes(b"\xff\xfe\x80"),
         "not readable JSON.*collect it again",
     ),
-    "other format": (lambda f: sign(f, format=99), "has format 99, this version reads 1 and 2"),
+    "other format": (lambda f: sign(f, format=99), "has format 99, this version reads 1, 2 and 3"),
     "no format": (lambda f: sign(f, format=True), "format must be an integer, found True"),
     "another count": (
         lambda f: sign(f, num_trajectories=5),
@@ -560,3 +563,114 @@ def test_observations_keep_their_shape_and_dtype(tmp_path, dataset):
 def test_observations_of_another_kind(dataset, dtype, spec, says):
     with pytest.raises(DataError, match=says):
         check_dataset(with_pictures(dataset, dtype), "here", spec)
+
+
+# Datasets that are mapped into memory
+
+
+@pytest.fixture
+def mapped(tmp_path, dataset):
+    whole = replace(dataset, terminated=np.array([1, 0, 0, 1], bool), truncated=np.ones(4, bool))
+    save_dataset(tmp_path / "mapped", whole, {"env": "toy"}, mapped=True)
+    return tmp_path / "mapped"
+
+
+def test_a_mapped_dataset_is_what_was_written_and_is_not_read(mapped, dataset):
+    loaded, manifest = load_dataset(mapped, SPEC)
+    assert_equal(
+        replace(loaded, terminated=None, truncated=None, lengths=np.array(loaded.lengths)), dataset
+    )
+    assert isinstance(loaded.obs, np.memmap)
+    assert not loaded.obs.flags.writeable
+    assert not isinstance(loaded.lengths, np.memmap)
+    assert (manifest["format"], manifest["num_trajectories"], manifest["num_steps"]) == (3, 4, 17)
+    assert loaded.terminated.tolist() == [True, False, False, True]
+    assert loaded.slice(1, 3).truncated.tolist() == [True, True]
+
+
+def test_batches_of_a_mapped_dataset_are_bit_for_bit_those_of_one_in_memory(mapped, folder):
+    """Over several pools of draws, for both halves of a training's dataset."""
+    there, _ = load_dataset(mapped, SPEC)
+    here, _ = load_dataset(folder, SPEC)
+    for begin, end in ((0, 3), (3, 4)):
+        pairs = zip(plans(there.slice(begin, end)), plans(here.slice(begin, end)), strict=True)
+        for batch, other in islice(pairs, 8):
+            for part, other_part in zip(batch, other, strict=True):
+                one = there.slice(begin, end).gather(*part)
+                two = here.slice(begin, end).gather(*other_part)
+                assert one.steps.keys() == two.steps.keys()
+                for name, rows in one.steps.items():
+                    assert rows.tobytes() == two.steps[name].tobytes()
+                    assert type(rows) is np.ndarray
+                assert one.length.tobytes() == two.length.tobytes()
+
+
+def test_what_was_let_go_is_read_again(tmp_path, monkeypatch):
+    """Pages that were taken out of memory come back with what they held."""
+    monkeypatch.setattr(schema, "RESIDENT", 0)
+    big = make_dataset([9] * 200)
+    save_dataset(tmp_path / "big", big, {}, mapped=True)
+    loaded, _ = load_dataset(tmp_path / "big", SPEC)
+    for _ in range(3):
+        part = loaded.gather(np.arange(200), np.full(200, 9), 9)
+        np.testing.assert_array_equal(part.obs.reshape(-1, 2), big.obs)
+
+
+@pytest.mark.parametrize(
+    ("damage", "says"),
+    [
+        (lambda path: path.unlink(), "obs.npy is missing or differs from the hash"),
+        (lambda path: path.write_bytes(b"no array"), "obs.npy is missing or differs from the hash"),
+        (
+            lambda path: path.write_bytes(path.read_bytes()[:-4]),
+            "obs.npy is missing or differs from the hash",
+        ),
+    ],
+)
+def test_damaged_files_of_a_mapped_dataset_are_refused(mapped, damage, says):
+    damage(mapped / "obs.npy")
+    with pytest.raises(DataError, match=rf"{says}.*; remove .*mapped and import it again"):
+        load_dataset(mapped)
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"no array", "obs.npy is no array"),
+        (np.zeros((17, 2), ">f4"), "has the dtype or order >f4"),
+        (np.asfortranarray(np.zeros((17, 2), np.float32)), "has the dtype or order float32"),
+        (np.zeros((16, 2), np.float32), r"obs has shape \[16, 2\], wanted \[step 17, 2\]"),
+        (np.full((17, 2), np.nan, np.float32), "obs holds NaN at step 0"),
+    ],
+)
+def test_files_with_a_sound_hash_and_wrong_arrays_are_refused(mapped, content, says):
+    path, manifest = mapped / "obs.npy", mapped / MANIFEST
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        np.save(path, content)
+    document = json.loads(manifest.read_text())
+    document["files"]["obs"] = hash_file(path)
+    document["sha256"] = hash_of_files(document["files"])
+    manifest.write_text(json.dumps(document))
+    with pytest.raises(DataError, match=says):
+        load_dataset(mapped, SPEC)
+
+
+def test_a_list_of_files_that_is_not_that_of_the_hash_is_refused(mapped):
+    document = json.loads((mapped / MANIFEST).read_text())
+    del document["files"]["rewards"]
+    (mapped / MANIFEST).write_text(json.dumps(document))
+    with pytest.raises(DataError, match="sha256 is not that of its list of files"):
+        load_dataset(mapped)
+
+
+@pytest.mark.parametrize("kind", ["mapped", "folder"])
+def test_facts_are_read_without_the_steps(request, kind):
+    facts = read_facts(request.getfixturevalue(kind))
+    assert (facts.num_trajectories, facts.num_steps, facts.longest) == (4, 17, 9)
+    assert (facts.obs_shape, facts.obs_dtype, facts.goal_dim) == ((2,), "float32", 3)
+    assert facts.num_actions == facts.action_dim == 4
+    assert facts.mean_length == 17 / 4
+    spec = spec_of(facts)
+    assert (spec.actions, spec.horizon, spec.obs) == (Discrete(4), 9, SPEC.obs)

@@ -1,0 +1,220 @@
+"""The ``manifest.json`` of a dataset, and what is known of one before its steps are read. Imports no jax.
+
+A dataset lies on disk in one of two forms. What a demonstrator collected is ``trajectories.npz``,
+compressed. What was imported is a file ``NAME.npy`` for each array, uncompressed, which is mapped into
+memory instead of read: such a dataset may be larger than the memory.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from annotated_types import Ge, Le, MaxLen
+from pydantic import BaseModel
+
+from envs.errors import DataError
+from mgpo_jax.schema import (
+    STRICT,
+    ArrayField,
+    ArrayHeader,
+    DemonstratorName,
+    Json,
+    Name,
+    Sha256,
+    array_headers,
+    checked_entry,
+    mapped_arrays,
+    mapped_headers,
+    read_arrays,
+    read_document,
+)
+from mgpo_jax.settings import Count, Index, Seed
+
+PACKED, MAPPED = 2, 3
+"""The formats that are written. 1 had neither rewards nor last observations, and called achieved goals
+"goals"."""
+FORMATS = (1, PACKED, MAPPED)
+ARRAYS = "trajectories.npz"
+MANIFEST = "manifest.json"
+
+Size = Annotated[int, Ge(1), Le(1_000_000)]
+Bound = Annotated[float, Ge(-1e18), Le(1e18)]
+
+
+class SpecEntry(BaseModel):
+    """What a manifest says of the world that the logs are from, where no world is registered for it."""
+
+    model_config = STRICT
+
+    name: Name
+    horizon: Size
+    """Number of steps after which an episode is cut off."""
+    num_actions: Size | None = None
+    """Number of discrete actions; null where they are continuous."""
+    truncate_in_hindsight: bool = True
+    """Whether a trajectory that is cut at any step shows how to reach another goal."""
+    action_low: Annotated[list[Bound], MaxLen(10_000)] = []
+    """What -1 stands for in each component of an action; empty where actions are as they were."""
+    action_high: Annotated[list[Bound], MaxLen(10_000)] = []
+    """What 1 stands for, likewise."""
+
+
+class Manifest(BaseModel):
+    """What is known of the entries of ``manifest.json``; there may be others."""
+
+    model_config = {**STRICT, "extra": "ignore"}
+
+    format: int
+    sha256: Sha256
+    num_trajectories: Count = 0
+    num_steps: Count = 0
+    """0 where the manifest does not say."""
+    files: Annotated[dict[Name, Sha256], MaxLen(32)] = {}
+    """The hash of each array's file, by the name of the array; only of mapped datasets."""
+    spec: SpecEntry | None = None
+    env: Name | None = None
+    policy: DemonstratorName | None = None
+    settings: dict[str, Json] = {}
+    seed: Seed | None = None
+    versions: dict[str, str] = {}
+    tried_again: Index = 0
+    failed_episodes: Index = 0
+    dropped_test_tasks: Index = 0
+    length: dict[str, Json] = {}
+    at_horizon: Annotated[float, Ge(0), Le(1)] = 0
+    hindsight_return: dict[str, Json] = {}
+    variants: dict[str, Index] = {}
+    """How many trajectories each variant of the world has, by its name, in the order of their indices."""
+
+
+def mend_for(folder: Path) -> str:
+    """What mends a damaged dataset, the end of a message."""
+    mapped = (Path(folder) / "actions.npy").exists()
+    return f"remove {folder} and {'import' if mapped else 'collect'} it again"
+
+
+def read_manifest(folder: Path, mend: str = "") -> tuple[dict[str, Any], Manifest]:
+    """The manifest of a dataset, as it is and as far as it is known.
+
+    Raises:
+      DataError: if there is none, or it is damaged or of another format.
+    """
+    path, mend = Path(folder) / MANIFEST, mend or mend_for(folder)
+    if not path.is_file():
+        raise DataError(f"no dataset in {folder} ({MANIFEST} is missing); {mend}")
+    document = read_document(path, dict[str, Json], mend)
+    manifest: Manifest = checked_entry(document, Manifest, path, "", mend)
+    if manifest.format not in FORMATS:
+        known = ", ".join(map(str, FORMATS[:-1]))
+        raise DataError(
+            f"{path} has format {manifest.format}, this version reads {known} and {FORMATS[-1]}; {mend}"
+        )
+    if manifest.format == MAPPED and hash_of_files(manifest.files) != manifest.sha256:
+        raise DataError(f"{path}: sha256 is not that of its list of files; {mend}")
+    return document, manifest
+
+
+def hash_of_files(files: Mapping[str, str]) -> str:
+    """The hash of a mapped dataset: SHA-256 of the lines ``HASH  NAME.npy`` in the order of the names."""
+    lines = "".join(f"{files[name]}  {name}.npy\n" for name in sorted(files))
+    return hashlib.sha256(lines.encode()).hexdigest()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Facts:
+    """What a training has to know of a dataset before it reads it.
+
+    Attributes:
+      folder: where it lies.
+      num_trajectories: N.
+      num_steps: of all trajectories.
+      longest: number of steps of the longest one.
+      obs_shape: of an observation.
+      obs_dtype: of an observation.
+      goal_dim: size G of a goal.
+      num_actions: number of discrete actions, or None.
+      action_dim: ``num_actions``, or the size A of a continuous action.
+      spec: what the manifest says of the world; where it says nothing, what the arrays show.
+      env: the world that it was collected in, if any.
+    """
+
+    folder: Path
+    num_trajectories: int
+    num_steps: int
+    longest: int
+    obs_shape: tuple[int, ...]
+    obs_dtype: str
+    goal_dim: int
+    num_actions: int | None
+    action_dim: int
+    spec: SpecEntry
+    env: str | None
+
+    @property
+    def mean_length(self) -> float:
+        """Mean number of steps of a trajectory."""
+        return self.num_steps / self.num_trajectories
+
+    @property
+    def obs_size(self) -> int:
+        """Number of components of an observation."""
+        return int(np.prod(self.obs_shape, dtype=np.int64))
+
+
+def read_facts(folder: Path) -> Facts:
+    """What is known of a dataset without reading its observations.
+
+    Raises:
+      DataError: if there is none, or it is damaged as far as it is looked at.
+    """
+    folder = Path(folder)
+    mend = mend_for(folder)
+    document, manifest = read_manifest(folder)
+    del document
+    mapped = manifest.format == MAPPED
+    headers = mapped_headers(folder, manifest.files, mend) if mapped else {}
+    headers = headers or array_headers(folder / ARRAYS, mend)
+    goals = headers.get("achieved_goals") or headers.get("goals")
+    fields = {"lengths": ArrayField(("trajectory",), "int32", low=1)}
+    sound = "obs" in headers and goals is not None and "actions" in headers
+    if not sound or len(headers["obs"].shape) < 1 or len(goals.shape if goals else ()) != 2:
+        raise DataError(f"{folder} lacks obs, actions or goals; {mend}")
+    assert goals is not None
+    actions = headers["actions"]
+    discrete = actions.dtype.kind in "iu"
+    known = manifest.spec.num_actions if manifest.spec else None
+    if discrete and known is None:
+        fields["actions"] = ArrayField(("step",), "int32", low=0)
+    if mapped:
+        arrays = mapped_arrays(folder, fields, {}, mend)
+    else:
+        arrays = read_arrays(folder / ARRAYS, fields, mend=mend)
+    lengths = arrays["lengths"]
+    if discrete and known is None:
+        known = 1 + int(arrays["actions"].max(initial=0))
+    longest = int(lengths.max(initial=1))
+    spec = manifest.spec or SpecEntry(
+        name=manifest.env or "data", horizon=longest, num_actions=known if discrete else None
+    )
+    return Facts(
+        folder=folder,
+        num_trajectories=len(lengths),
+        num_steps=int(lengths.sum(dtype=np.int64)),
+        longest=longest,
+        obs_shape=headers["obs"].shape[1:],
+        obs_dtype=str(headers["obs"].dtype),
+        goal_dim=goals.shape[1],
+        num_actions=known if discrete else None,
+        action_dim=known if discrete and known else _size(actions),
+        spec=spec,
+        env=manifest.env,
+    )
+
+
+def _size(actions: ArrayHeader) -> int:
+    return actions.shape[1] if len(actions.shape) == 2 else 1
