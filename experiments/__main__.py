@@ -12,6 +12,7 @@ COMMANDS = {
     "list": "the worlds, methods and networks there are, and what each needs",
     "info": "what is installed, on which devices",
     "collect": "collect a dataset of demonstrations",
+    "data": "import, export, check and describe datasets of your own logs",
     "pretrain": "pre-train a policy",
     "adapt": "adapt a policy to unseen tasks",
     "evaluate": "evaluate optimized prompts once more, under noise or in another world",

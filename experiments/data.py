@@ -1,0 +1,101 @@
+"""Datasets of your own logs: ``python -m experiments.data import logs.hdf5 --goal-columns 0 1 --out mine``.
+
+``import`` makes a dataset of logs, ``export`` makes logs of a dataset, ``check`` says what is wrong with a
+dataset, and ``info`` what is in it.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn
+
+from envs.errors import DataError, UsageError, nearest
+from experiments.runtime import refuse_existing, refuse_existing_file, run, say
+from experiments.store.data_settings import (
+    SUBCOMMANDS,
+    CheckDataConfig,
+    DataCommandConfig,
+    ExportConfig,
+    ImportConfig,
+    InfoConfig,
+    check_import,
+    require_folder,
+)
+
+
+def main(config: DataCommandConfig) -> None:
+    """Import, export, check or describe datasets of your own logs."""
+    if not config.what:
+        raise UsageError(
+            f"no command given; name one of {', '.join(SUBCOMMANDS)}, such as "
+            "`python -m experiments.data import --help`"
+        )
+    raise nearest(config.what, SUBCOMMANDS, "command of experiments.data")
+
+
+def import_logs(config: ImportConfig) -> None:
+    """Make a dataset of logs, which `experiments.pretrain --data FOLDER` trains on."""
+    check_import(config)
+    assert config.out is not None
+    refuse_existing(config.out, "remove it", "choose another with --out")
+    from experiments.importing import import_dataset
+
+    say(import_dataset(config))
+
+
+def export_logs(config: ExportConfig) -> None:
+    """Write a dataset as flat arrays in an npz file, or as a Minari dataset in a folder."""
+    folder = require_folder(config.folder, "export")
+    if config.out is None:
+        raise UsageError("--out is missing; give an npz file, or a folder for a Minari dataset")
+    if config.out.suffix == ".npz":
+        refuse_existing_file(config.out, "--out")
+    else:
+        refuse_existing(config.out, "remove it", "choose another with --out")
+    from experiments.exporting_data import export_dataset
+
+    export_dataset(folder, config.out, config.author)
+    print(f"written to {config.out}", file=sys.stderr)
+
+
+def check_data(config: CheckDataConfig) -> None:
+    """Say what is wrong with a dataset, one sentence for each finding; exits with 1 if anything is."""
+    folder = require_folder(config.folder, "check")
+    from experiments.soundness import examine
+
+    found = examine(folder, config.env, config.horizon)
+    for line in found.lines(config.most):
+        say(line)
+    if found.faults:
+        raise DataError(
+            f"{folder} has {found.num_faults} fault(s) of {len(found.faults)} kind(s); mend the logs, or "
+            "leave these trajectories out, and import them again"
+        )
+
+
+def show_info(config: InfoConfig) -> None:
+    """Say what is in a dataset: counts, lengths, shapes, spreads, sizes, and who made it."""
+    folder = require_folder(config.folder, "info")
+    from experiments.soundness import described
+
+    say(described(folder))
+
+
+RUNS: dict[str, Callable[[Any], None]] = {
+    "import": import_logs,
+    "export": export_logs,
+    "check": check_data,
+    "info": show_info,
+}
+
+
+def command(argv: Sequence[str] | None = None) -> NoReturn:
+    words = list(sys.argv[1:] if argv is None else argv)
+    if words and words[0] in SUBCOMMANDS:
+        run(SUBCOMMANDS[words[0]], RUNS[words[0]], argv=words[1:])
+    run(DataCommandConfig, main, argv=words)
+
+
+if __name__ == "__main__":
+    command()

@@ -1,0 +1,480 @@
+"""Logs of others as a dataset: one episode is read, checked and written after the other.
+
+An episode of T actions has T + 1 observations. Of an episode with only T the last action is left out, since
+nobody knows what came of it. Goals are told by a function, or are columns or arrays of the logs; row t + 1
+is what was achieved by action t.
+"""
+
+from __future__ import annotations
+
+import getpass
+import importlib
+import inspect
+import os
+import re
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from envs.errors import DataError, UsageError, printable, shown
+from experiments.sources import ACTIONS, TERMINATED, TRUNCATED, Source, first_of, opened
+from experiments.store.data_settings import ImportConfig
+from experiments.store.provenance import versions
+from mgpo_jax.dataset import finish_mapped
+from mgpo_jax.files import new_folder
+from mgpo_jax.progress import Progress
+
+OBSERVATIONS = ("observations", "observation", "obs", "observations/observation")
+NEXT = ("next_observations", "next_observation", "next_obs")
+REWARDS = ("rewards", "reward")
+OWN_BY_STEP = ("achieved_goals", "goal_reached", "outcomes", "intended")
+OWN_BY_TRAJECTORY = ("task_hashes", "variants")
+"""Arrays that our own exports have, and that are taken as they are."""
+DTYPES = {"achieved_goals": np.float32, "goal_reached": np.bool_, "outcomes": np.float32}
+LARGEST_INT = np.iinfo(np.int32)
+
+Rows = dict[str, np.ndarray]
+
+
+class BadEpisodeError(DataError):
+    """One episode cannot be used, whatever the others are."""
+
+
+class Appender:
+    """Appends rows to an npy file, whose header is set right at the end."""
+
+    def __init__(self, path: Path, row: np.ndarray) -> None:
+        self.file = open(path, "wb")  # noqa: SIM115 (closed by finish)
+        self.shape, self.dtype, self.num = row.shape[1:], row.dtype, 0
+        self._write_header()
+        self.start = self.file.tell()
+
+    def _write_header(self) -> None:
+        # The header of npy files leaves room for the first axis to grow.
+        header = {
+            "descr": np.lib.format.dtype_to_descr(self.dtype),
+            "fortran_order": False,
+            "shape": (self.num, *self.shape),
+        }
+        np.lib.format.write_array_header_1_0(self.file, header)
+
+    def append(self, rows: np.ndarray) -> None:
+        self.file.write(np.ascontiguousarray(rows).tobytes())
+        self.num += len(rows)
+
+    def finish(self) -> None:
+        self.file.seek(0)
+        self._write_header()
+        if self.file.tell() != self.start:
+            raise RuntimeError("the header of an npy file has grown")
+        self.file.close()
+
+
+class Writer:
+    """Writes the arrays of trajectories one after the other; all have the same names, shapes and dtypes."""
+
+    def __init__(self, place: Path) -> None:
+        self.place, self.files = place, dict[str, Appender]()
+        self.lengths: list[int] = []
+
+    def add(self, who: str, rows: Rows) -> None:
+        if not self.lengths:
+            self.files = {n: Appender(self.place / f"{n}.npy", a) for n, a in rows.items()}
+        if self.files.keys() != rows.keys():
+            odd = min(self.files.keys() ^ rows.keys())
+            raise DataError(
+                f"{who} has {'no ' if odd in self.files else ''}{odd}, unlike those before it; "
+                "log the same arrays in all episodes"
+            )
+        for name, array in rows.items():
+            file = self.files[name]
+            if (array.shape[1:], array.dtype) != (file.shape, file.dtype):
+                raise DataError(
+                    f"{who}: {name} has rows of {array.dtype}{list(array.shape[1:])}, those before have "
+                    f"{file.dtype}{list(file.shape)}; import them one kind at a time"
+                )
+            file.append(array)
+        self.lengths.append(len(rows["actions"]))
+
+    def finish(self, manifest: dict[str, Any]) -> None:
+        lengths = np.array(self.lengths, np.int32)
+        for file in self.files.values():
+            file.finish()
+        np.save(self.place / "lengths.npy", lengths)
+        names = [*self.files, "lengths"]
+        finish_mapped(self.place, names, len(lengths), int(lengths.sum()), manifest)
+
+
+def named(name: str, arrays: Mapping[str, np.ndarray], who: str) -> np.ndarray:
+    """The array of a name, or the only one whose name ends with it after a slash."""
+    if name in arrays:
+        return arrays[name]
+    found = [key for key in arrays if key.endswith(f"/{name}")]
+    if len(found) == 1:
+        return arrays[found[0]]
+    what = "several arrays" if found else "no array"
+    raise DataError(
+        f"{who} has {what} named {shown(name)}; it has {printable(', '.join(sorted(found or arrays)))}"
+    )
+
+
+def load_function(place: str) -> Callable[..., Any]:
+    """The function at ``module:function``, also of a module in the current folder.
+
+    Raises:
+      UsageError: if there is none.
+    """
+    module, _, attribute = place.partition(":")
+    if (here := os.getcwd()) not in sys.path:
+        sys.path.append(here)  # last, so that the current folder never shadows a package
+    try:
+        function = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise UsageError(f"--goal {place} cannot be loaded: {printable(str(error))}") from None
+    if not callable(function):
+        raise UsageError(f"--goal {place} is no function, found {shown(function)}")
+    return function
+
+
+def _wants_episode(function: Callable[..., Any]) -> bool:
+    try:
+        return next(iter(inspect.signature(function).parameters), "") == "episode"
+    except (TypeError, ValueError):  # functions of C have no signature
+        return False
+
+
+def observations(config: ImportConfig, arrays: Mapping[str, np.ndarray], who: str) -> np.ndarray:
+    """The observations of an episode, [T + 1, ...] or [T, ...], in a dtype that a network takes."""
+    if config.obs_arrays:
+        parts = [named(name, arrays, who) for name in config.obs_arrays]
+    else:
+        found = first_of(OBSERVATIONS, arrays)
+        if found is None:
+            raise DataError(
+                f"{who} has no observations; it has {printable(', '.join(sorted(arrays)))}; name the "
+                "arrays that are the observation with --obs-arrays"
+            )
+        parts = [found]
+    if len(parts) == 1:
+        return parts[0]
+    if len({len(part) for part in parts}) > 1:
+        raise DataError(f"{who}: the arrays of the observation have different numbers of rows")
+    return np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
+
+
+def suited(array: np.ndarray, who: str, what: str) -> np.ndarray:
+    """An array with at most 32 bits a number, as programs take it."""
+    if array.dtype.kind == "f" and array.dtype.itemsize > 4:
+        return array.astype(np.float32)
+    if array.dtype.itemsize == 8:
+        if len(array) and not LARGEST_INT.min <= array.min() <= array.max() <= LARGEST_INT.max:
+            raise DataError(f"{who}: {what} hold {int(array.max())}, which needs more than 32 bits")
+        return array.astype(np.int32)
+    return array.astype(array.dtype.newbyteorder("="))
+
+
+class Converter:
+    """Episodes of some logs as the rows of a dataset.
+
+    Args:
+      config: what the user wants.
+      source: the logs.
+    """
+
+    def __init__(self, config: ImportConfig, source: Source) -> None:
+        self.config, self.source = config, source
+        self.function = load_function(config.goal) if config.goal else None
+        self.num_cut = 0
+        """Episodes without an observation after their last action."""
+
+    def rows(self, who: str, arrays: Mapping[str, np.ndarray]) -> Rows:
+        """One episode.
+
+        Raises:
+          DataError: if it is not as it should be.
+        """
+        obs = observations(self.config, arrays, who)
+        actions = first_of(ACTIONS, arrays)
+        if actions is None:
+            raise DataError(f"{who} has no actions; it has {printable(', '.join(sorted(arrays)))}")
+        num, after = len(actions), first_of(NEXT, arrays)
+        if num and len(obs) == num and after is not None and len(after) == num:
+            obs = np.concatenate([obs, after[-1:]])
+        if len(obs) == num:
+            num -= 1
+            self.num_cut += 1
+        if num < 1 or len(obs) != num + 1:
+            raise BadEpisodeError(
+                f"{who} has {len(obs)} observations and {len(actions)} actions; an episode of T "
+                f"actions needs "
+                "T + 1 observations"
+            )
+        obs = suited(obs, who, "observations")
+        rows: Rows = {"obs": obs[:num], "actions": self.actions(actions[:num], who)}
+        rows |= self.goals(who, arrays, obs, num)
+        rewards = first_of(REWARDS, arrays)
+        if rewards is not None and not self._lacks("rewards"):
+            rows["rewards"] = np.asarray(rewards, np.float32).reshape(-1)[:num]
+        rows["last_obs"] = obs[-1:]
+        cut_off = len(actions) > num
+        ends = {} if self._lacks("ends") else {"terminated": TERMINATED, "truncated": TRUNCATED}
+        for name, names in ends.items():
+            flag = first_of(names, arrays)
+            # An end that was left out did not happen.
+            ended = flag is not None and not cut_off and bool(np.reshape(flag, -1)[-1])
+            rows[name] = np.array([ended])
+        for name in OWN_BY_TRAJECTORY:
+            if name in arrays:
+                rows[name] = np.reshape(arrays[name], -1)[:1]
+        check_rows(who, rows, num)
+        return rows
+
+    def _lacks(self, what: str) -> bool:
+        """Whether one of our own exports says that its dataset had none of something."""
+        return bool((sized_of(self.source, f"without_{what}") or [False])[0])
+
+    def actions(self, actions: np.ndarray, who: str) -> np.ndarray:
+        """Actions as the network gives them: numbers from 0 on, or numbers in [-1, 1]."""
+        low, high = np.array(self.config.action_low), np.array(self.config.action_high)
+        if actions.dtype.kind in "iu" and not len(low):
+            if actions.ndim == 2 and actions.shape[1] == 1:
+                actions = actions[:, 0]
+            if actions.ndim != 1:
+                raise DataError(
+                    f"{who}: integer actions must have one number a step, found shape "
+                    f"{list(actions.shape)}; "
+                    "give --action-low and --action-high if they are amounts"
+                )
+            most = self.config.num_actions or self.source.num_actions or LARGEST_INT.max
+            if actions.min() < 0 or actions.max() >= most:
+                raise DataError(
+                    f"{who}: actions are {actions.min()} to {actions.max()}, must be from 0 to {most - 1}; "
+                    "see --num-actions"
+                )
+            return actions.astype(np.int32)
+        if actions.dtype.kind not in "iuf":
+            raise DataError(f"{who}: actions must be numbers, found {actions.dtype}")
+        rows = actions.reshape(len(actions), -1).astype(np.float32)
+        if len(low) > 1 and len(low) != rows.shape[1]:
+            raise UsageError(
+                f"--action-low has {len(low)} numbers, an action has {rows.shape[1]}; give one, or "
+                f"one for each"
+            )
+        if len(low):
+            rows = (2 * (rows - low) / (high - low) - 1).astype(np.float32)
+        if np.isfinite(rows).all() and np.abs(rows).max() > 1 + 1e-5:
+            given = "after scaling they" if len(low) else "they"
+            raise DataError(
+                f"{who}: actions must be in [-1, 1], {given} go from {rows.min():g} to "
+                f"{rows.max():g}; give "
+                "their bounds with --action-low and --action-high"
+            )
+        return np.where(np.isfinite(rows), np.clip(rows, -1, 1), rows)
+
+    def goals(self, who: str, arrays: Mapping[str, np.ndarray], obs: np.ndarray, num: int) -> Rows:
+        """Achieved goals, whether they count as reached, and outcomes, after each of ``num`` actions."""
+        found = {
+            name: np.asarray(arrays[name][:num], DTYPES.get(name))
+            for name in OWN_BY_STEP
+            if name in arrays
+        }
+        config = self.config
+        if config.goal or config.goal_columns or config.goal_array:
+            for name in ("achieved_goals", "goal_reached", "outcomes"):
+                found.pop(name, None)
+        elif "achieved_goals" not in found:
+            size = int(np.prod(obs.shape[1:]))
+            raise UsageError(
+                f"nothing says what a goal is; give --goal-columns with some of the {size} "
+                f"components of an "
+                f"observation, --goal-array with one of {printable(', '.join(sorted(arrays)))}, or --goal "
+                "module:function"
+            )
+        if "achieved_goals" not in found:
+            goals = self._achieved(who, arrays, obs, num)
+            found["achieved_goals"] = goals[-num:]
+            changes = np.ones(num, bool)
+            if config.reached == "changes":
+                changes = np.any(np.diff(goals, axis=0), axis=1)
+                # Without a goal before the first action it counts as reached by that.
+                changes = np.concatenate([np.ones(num - len(changes), bool), changes])
+            found["goal_reached"] = changes
+        found.setdefault("goal_reached", np.ones(num, bool))
+        found.setdefault("outcomes", found["achieved_goals"])
+        if "intended" in found:
+            found["intended"] = self.actions(arrays["intended"][:num], f"{who}, intended")
+        return found
+
+    def _achieved(
+        self, who: str, arrays: Mapping[str, np.ndarray], obs: np.ndarray, num: int
+    ) -> np.ndarray:
+        """Achieved goals as a function, columns or an array tells them: [T + 1, G], or [T, G] "
+        "after actions."""
+        config = self.config
+        if config.goal_columns:
+            flat = obs.reshape(len(obs), -1)
+            if (most := max(config.goal_columns)) >= flat.shape[1]:
+                raise UsageError(
+                    f"--goal-columns {most} is none of the {flat.shape[1]} components of an "
+                    f"observation, which "
+                    "are counted from 0"
+                )
+            found, what = flat[:, list(config.goal_columns)], "--goal-columns"
+        elif config.goal_array:
+            found, what = named(config.goal_array, arrays, who), f"--goal-array {config.goal_array}"
+        else:
+            assert self.function is not None
+            what = f"--goal {config.goal}"
+            found = self._told(who, arrays, obs, what)
+        goals = np.asarray(found)
+        if goals.ndim == 1:
+            goals = goals[:, None]
+        rows = (num + 1,) if config.goal_array else (num + 1, num)
+        if goals.dtype.kind not in "biuf" or goals.ndim != 2 or len(goals) not in rows:
+            raise DataError(
+                f"{who}: {what} gives {goals.dtype}{list(goals.shape)}, wanted numbers [{num + 1}, "
+                f"G]: a goal "
+                "for every observation, the last one included"
+            )
+        return goals.astype(np.float32)
+
+    def _told(self, who: str, arrays: Mapping[str, np.ndarray], obs: np.ndarray, what: str) -> Any:
+        assert self.function is not None
+        whole = _wants_episode(self.function)
+        given = SimpleNamespace(**{**arrays, "observations": obs}) if whole else obs
+        try:
+            return self.function(given)
+        except Exception as error:  # a function of a user may raise anything
+            kind = type(error).__name__
+            raise DataError(f"{who}: {what} raised {kind}: {printable(str(error))}") from None
+
+
+def check_rows(who: str, rows: Rows, num: int) -> None:
+    """Raise for arrays with another number of rows than actions, and for NaN and infinity."""
+    for name, array in rows.items():
+        one = name in ("last_obs", "terminated", "truncated", *OWN_BY_TRAJECTORY)
+        if len(array) != (1 if one else num):
+            raise BadEpisodeError(f"{who}: {name} has {len(array)} rows, wanted {num}")
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            bad = ~np.isfinite(array.reshape(len(array), -1))
+            step = num if one else int(np.flatnonzero(bad.any(axis=1))[0])
+            raise BadEpisodeError(f"{who}, step {step}: {name} holds NaN or infinity")
+
+
+def import_dataset(config: ImportConfig) -> str:
+    """Make a dataset of logs; returns what there is to say of it.
+
+    Raises:
+      UsageError: if the settings do not fit the logs.
+      DataError: if the logs are not as they should be.
+    """
+    assert config.out is not None
+    skipped: list[str] = []
+    with opened(config.source) as source, new_folder(config.out) as place:
+        converter, writer = Converter(config, source), Writer(place)
+        horizon = _horizon(config, source)
+        with Progress(source.num, "episode") as progress:
+            for who, arrays in source.episodes:
+                try:
+                    rows = converter.rows(who, arrays)
+                    _check_length(who, len(rows["actions"]), horizon)
+                except BadEpisodeError as error:
+                    if not config.skip_bad:
+                        text = f"{error}; mend it, or leave such episodes out with --skip-bad"
+                        raise DataError(text) from None
+                    skipped.append(str(error))
+                    continue
+                writer.add(who, rows)
+                progress.update()
+        if not writer.lengths:
+            raise DataError(f"{config.source} has no episode that can be used")
+        manifest = _manifest(config, source, writer, horizon, skipped)
+        writer.finish(manifest)
+    lengths = np.array(writer.lengths)
+    said = [
+        f"{config.out}: {len(lengths)} trajectories of {lengths.min()} to {lengths.max()} steps, "
+        f"{lengths.sum()} in all"
+    ]
+    if converter.num_cut:
+        said.append(
+            f"  {converter.num_cut} episodes have no observation after their last action, which "
+            f"was left out"
+        )
+    said += [f"  left out: {printable(text)}" for text in skipped[:5]]
+    if len(skipped) > 5:
+        said.append(f"  left out: {len(skipped) - 5} more")
+    return "\n".join(said)
+
+
+def sized_of(source: Source, name: str) -> Any:
+    """What our own exports say of all episodes; None where they say nothing."""
+    return source.sized[name].reshape(-1).tolist() if name in source.sized else None
+
+
+def _horizon(config: ImportConfig, source: Source) -> int | None:
+    own = sized_of(source, "horizon")
+    return config.horizon or (int(own[0]) if own else source.horizon)
+
+
+def _check_length(who: str, length: int, horizon: int | None) -> None:
+    if horizon is not None and length > horizon:
+        raise BadEpisodeError(f"{who} has {length} steps, the horizon is {horizon} (see --horizon)")
+
+
+def _manifest(
+    config: ImportConfig,
+    source: Source,
+    writer: Writer,
+    horizon: int | None,
+    skipped: list[str],
+) -> dict[str, Any]:
+    """What the manifest says beside hashes and counts."""
+    lengths = np.array(writer.lengths)
+    discrete = writer.files["actions"].dtype.kind in "iu"
+    size = 1 if discrete else writer.files["actions"].shape[0]
+    known = config.num_actions or (sized_of(source, "num_actions") or [source.num_actions])[0]
+    cut = sized_of(source, "cut_in_hindsight")
+    if discrete and known is None:
+        writer.files["actions"].file.flush()
+        path = writer.place / "actions.npy"
+        known = 1 + int(np.fromfile(path, np.int32, offset=writer.files["actions"].start).max())
+    stem = config.name or Path(config.source).absolute().stem
+    spec = {
+        "name": re.sub(r"[^\w.-]", "-", stem).lstrip("-.")[:100] or "data",
+        "horizon": int(horizon or lengths.max()),
+        "num_actions": int(known) if discrete else None,
+        "truncate_in_hindsight": bool(cut[0]) if cut and config.cut else config.cut,
+    }
+    for name in ("action_low", "action_high"):
+        bounds = list(getattr(config, name)) or sized_of(source, name) or []
+        spec[name] = bounds * size if len(bounds) == 1 else bounds
+    goal = config.goal or config.goal_array or list(config.goal_columns) or "achieved_goals"
+    return {
+        "spec": spec,
+        "imported": {
+            "source": str(config.source),
+            "kind": source.kind,
+            "author": source.author,
+            "by": _user(),
+            "goal": goal,
+            "obs_arrays": list(config.obs_arrays),
+            "reached": config.reached,
+            "left_out": len(skipped),
+        },
+        "versions": versions(),
+        "length": {
+            "mean": float(lengths.mean()),
+            "quartiles": np.percentile(lengths, [0, 25, 50, 75, 100]).tolist(),
+        },
+    }
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # a user without a name, as in some containers
+        return ""

@@ -1,0 +1,403 @@
+"""What is wrong with a dataset, in sentences, and what is in it.
+
+A fault is what a training should not learn from; a note is what may be meant so. Both name the trajectory
+and the step. What the heuristics are is said where they are: ``_misaligned`` and ``_wrong_ends``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import envs
+from envs.base import EnvSpec
+from envs.errors import printable
+from mgpo_jax.dataset import STEP_ARRAYS, Dataset, load_dataset
+from mgpo_jax.manifest import Facts, read_facts
+from mgpo_jax.schema import let_go
+
+SAMPLE = 20_000  # steps that the regressions look at
+MOST_NUMBERS = 256  # of an observation, for the regressions
+RIDGE = 1e-3  # of the mean variance of the inputs
+MARGIN = 0.1  # of the variance that is left, by which another step's action has to explain more
+
+
+@dataclass
+class Findings:
+    """What was found, by kind: sentences, in the order in which they were found."""
+
+    faults: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
+    notes: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
+
+    @property
+    def num_faults(self) -> int:
+        return sum(map(len, self.faults.values()))
+
+    def lines(self, most: int) -> Iterator[str]:
+        """What is printed: ``most`` of each kind, and how many more there are."""
+        for word, kinds in (("fault", self.faults), ("note", self.notes)):
+            for kind, found in kinds.items():
+                yield from (f"{word}: {text}" for text in found[:most])
+                if len(found) > most:
+                    yield f"{word}: {len(found) - most} more of this kind ({kind}); see --most"
+        if not self.faults:
+            yield "no faults"
+
+
+def examine(folder: Path, env: str | None = None, horizon: int | None = None) -> Findings:
+    """Look for everything that is known to go wrong in logs.
+
+    Args:
+      folder: where the dataset lies.
+      env: the world whose shapes and horizon it must have.
+      horizon: steps after which an episode is cut off (default: the world's, or the manifest's).
+
+    Raises:
+      DataError: if it is no dataset, damaged, or of other shapes than the world's.
+    """
+    facts, spec = read_facts(folder), None
+    if env is not None:
+        spec = envs.make(env).spec
+        horizon = horizon or spec.horizon
+    dataset, _ = load_dataset(folder, _any_length(spec), any_value=True)
+    found = Findings()
+    _not_finite(dataset, found)
+    if found.faults:
+        return found  # nothing else can be told of such numbers
+    _wrong_observations(dataset, found)
+    _misaligned(dataset, facts, found)
+    _wrong_ends(dataset, horizon or facts.spec.horizon, found)
+    _duplicates(dataset, found)
+    _idle_goals(dataset, found)
+    return found
+
+
+def _any_length(spec: EnvSpec | None) -> EnvSpec | None:
+    """The world without its horizon: lengths over it are a finding, not the end of the search."""
+    return None if spec is None else replace(spec, horizon=2**31 - 1)
+
+
+def _place(dataset: Dataset, row: int) -> str:
+    """Trajectory and step of a row of the arrays of all steps."""
+    index = int(np.searchsorted(np.cumsum(dataset.lengths), row, side="right"))
+    return f"trajectory {index}, step {row - int(dataset.starts[index])}"
+
+
+def _not_finite(dataset: Dataset, found: Findings) -> None:
+    """NaN, infinity, and actions out of range."""
+    for name, array in dataset.arrays.items():
+        if array.dtype.kind != "f":
+            continue
+        for first, piece in _pieces(array):
+            flat = piece.reshape(len(piece), -1)
+            for row in np.flatnonzero(~np.isfinite(flat).all(axis=1)):
+                value = flat[row][~np.isfinite(flat[row])][0]
+                word = "NaN" if np.isnan(value) else "infinity"
+                where = (
+                    f"trajectory {first + row}, after the last step"
+                    if len(array) == len(dataset) and name == "last_obs"
+                    else _place(dataset, first + int(row))
+                )
+                found.faults["not finite"].append(f"{where}: {name} holds {word}")
+            if name in ("actions", "intended"):
+                for row in np.flatnonzero((np.abs(flat) > 1).any(axis=1)):
+                    where, most = _place(dataset, first + int(row)), np.abs(flat[row]).max()
+                    found.faults["out of range"].append(
+                        f"{where}: {name} holds {most:g}, actions are from -1 to 1"
+                    )
+
+
+def _pieces(array: np.ndarray, size: int = 1 << 24) -> Iterator[tuple[int, np.ndarray]]:
+    """An array piece by piece, of which little is in memory at a time, with the first row of each."""
+    rows = max(1, size // max(1, array[:1].nbytes))
+    for first in range(0, len(array), rows):
+        yield first, np.asarray(array[first : first + rows])
+        let_go(array)
+
+
+def _wrong_observations(dataset: Dataset, found: Findings) -> None:
+    """Observations that belong to the episode before, and last observations that were not logged."""
+    if dataset.last_obs is None:
+        found.faults["last observation"].append(
+            f"trajectory 0, step {dataset.lengths[0]}: there is no observation after the last "
+            f"action, nor in "
+            "any other trajectory; an episode of T actions needs T + 1 observations"
+        )
+        return
+    num, starts = len(dataset), dataset.starts
+    first = dataset.obs[starts].reshape(num, -1)
+    final = dataset.obs[starts + dataset.lengths - 1].reshape(num, -1)
+    last = np.asarray(dataset.last_obs).reshape(num, -1)
+    same = [(first[lag:] == last[:-lag]).all(axis=1) for lag in range(1, min(5, num))]
+    # By chance a trajectory begins where another one ended, in worlds with few states.
+    chance = max((int(rows.sum()) for rows in same[1:]), default=0)
+    few = dataset.obs.dtype.kind != "f" and same and same[0].mean() <= 0.2
+    if same and same[0].sum() > 2 * chance and not few:
+        for index in (1 + np.flatnonzero(same[0])).tolist():
+            found.faults["off by one"].append(
+                f"trajectory {index}, step 0: the first observation is the last one of trajectory "
+                f"{index - 1}; "
+                "observations are off by one, or the episodes are split one step too late"
+            )
+    repeated, moved = (final == last).all(axis=1), False
+    for index in range(min(num, 100)):
+        rows = dataset.obs[starts[index] : starts[index] + dataset.lengths[index]]
+        moved |= bool((rows[1:] != rows[:-1]).any())
+    if num > 1 and repeated.all() and moved:
+        found.faults["last observation"].append(
+            f"trajectory 0, step {dataset.lengths[0]}: the observation after the last action "
+            f"repeats the one "
+            f"before it, as in all {num} trajectories; T observations were logged where T + 1 are needed"
+        )
+
+
+def _explained(inputs: np.ndarray, targets: np.ndarray) -> float:
+    """Share of the variance of some rows that a ridge regression on the first half predicts in "
+    "the second."""
+    half = len(inputs) // 2
+    inputs = inputs - inputs[:half].mean(axis=0)
+    inputs = inputs / np.where(inputs.std(axis=0) < 1e-8, 1, inputs.std(axis=0))
+    inputs = np.concatenate([inputs, np.ones((len(inputs), 1))], axis=1)
+    known, wanted = inputs[:half], targets[:half]
+    normal = known.T @ known + RIDGE * half * np.eye(known.shape[1])
+    error = targets[half:] - inputs[half:] @ np.linalg.solve(normal, known.T @ wanted)
+    spread = targets[half:] - targets[half:].mean(axis=0)
+    total = float((spread**2).sum())
+    return 1 - float((error**2).sum()) / total if total > 0 else 0.0
+
+
+def _misaligned(dataset: Dataset, facts: Facts, found: Findings) -> None:
+    """Actions that belong to the step before or after, where it can be told.
+
+    Ridge regressions predict the change of the observation from step t to t + 1, in its own spreads, from
+    the observations at t and t - 1 and the action in row t - 1, t or t + 1. It is a fault if the action of
+    another row explains at least ``MARGIN`` of the variance more than that of row t. An agent that only
+    reacts to what it sees gives rise to the same: its next action tells what it saw then. So where the
+    observation at t predicts half of the action in row t, the shift must show in the actions, too: the
+    observation that they would react to if they were shifted has to leave half as much unexplained.
+    """
+    if facts.obs_size > MOST_NUMBERS or facts.action_dim > MOST_NUMBERS:
+        found.notes["alignment"].append(
+            f"whether actions belong to their steps is not looked at: observations have {facts.obs_size} "
+            f"numbers, actions {facts.action_dim}, and {MOST_NUMBERS} are the most"
+        )
+        return
+    starts, lengths = dataset.starts, dataset.lengths
+    rows = [
+        np.arange(start + 1, start + length - 1)
+        for start, length in zip(starts, lengths, strict=True)
+        if length >= 4
+    ]
+    inner = np.concatenate([np.zeros(0, np.int64), *rows])
+    if len(inner) > SAMPLE:
+        inner = np.sort(np.random.default_rng(0).choice(inner, SAMPLE, replace=False))
+    inner = inner[np.argsort(np.random.default_rng(1).random(len(inner)))]
+    if len(inner) < 200:
+        found.notes["alignment"].append(
+            f"whether actions belong to their steps cannot be told from {len(inner)} steps; 200 are needed"
+        )
+        return
+    obs = {lag: _numbers(dataset.obs, inner + lag) for lag in (-1, 0, 1)}
+    actions = {lag: _acted(dataset, inner + lag, facts) for lag in (-1, 0, 1)}
+    change = obs[1] - obs[0]
+    change = change / np.where(change.std(axis=0) < 1e-8, 1, change.std(axis=0))
+    explained = {
+        lag: _explained(np.concatenate([obs[0], obs[-1], acted], axis=1), change)
+        for lag, acted in actions.items()
+    }
+    reacts = {lag: _explained(seen, actions[0]) for lag, seen in obs.items()}
+    for lag, where in ((-1, "step after"), (1, "step before")):
+        better = explained[lag] - explained[0]
+        shifted = reacts[0] < 0.5 or 1 - reacts[-lag] < 0.5 * (1 - reacts[0])
+        if better > MARGIN and shifted:
+            other = "before" if lag < 0 else "after"
+            found.faults["misaligned"].append(
+                f"{_place(dataset, int(inner.min()))} and all others: the action belongs to the "
+                f"{where} its "
+                f"own, for the action in the row {other} explains {explained[lag]:.0%} of how observations "
+                f"change, that in their own row {explained[0]:.0%}"
+            )
+
+
+def _numbers(array: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    return np.asarray(array[rows], np.float64).reshape(len(rows), -1)
+
+
+def _acted(dataset: Dataset, rows: np.ndarray, facts: Facts) -> np.ndarray:
+    """Actions as numbers, one-hot where they are discrete."""
+    if facts.num_actions is None:
+        return _numbers(dataset.actions, rows)
+    return np.eye(facts.num_actions)[np.asarray(dataset.actions[rows])]
+
+
+def _wrong_ends(dataset: Dataset, horizon: int, found: Findings) -> None:
+    """Lengths over the horizon, and time limits that are logged as ends of the task.
+
+    Ends are suspicious if at least three trajectories were terminated at the very horizon, and nine of ten
+    that have its length were. Being cut off before the horizon is a note, if others were cut off at it.
+    """
+    lengths = dataset.lengths
+    for index in np.flatnonzero(lengths > horizon).tolist():
+        found.faults["too long"].append(
+            f"trajectory {index}, step {horizon}: it has {lengths[index]} steps, the horizon is {horizon}"
+        )
+    if dataset.terminated is None or dataset.truncated is None:
+        return
+    at_horizon = lengths == horizon
+    ended = at_horizon & dataset.terminated & ~dataset.truncated
+    if ended.sum() >= 3 and ended.sum() >= 0.9 * at_horizon.sum():
+        for index in np.flatnonzero(ended).tolist():
+            found.faults["time limits"].append(
+                f"trajectory {index}, step {horizon - 1}: it is marked as terminated at the very "
+                f"horizon, as "
+                f"{ended.sum()} of {at_horizon.sum()} of this length are; a time limit is a truncation"
+            )
+    early = dataset.truncated & ~dataset.terminated & (lengths < horizon)
+    if early.any() and (dataset.truncated & at_horizon).any():
+        index = int(np.argmax(early))
+        found.notes["cut early"].append(
+            f"trajectory {index}, step {lengths[index] - 1}: it is marked as truncated before the "
+            f"horizon of "
+            f"{horizon}, as {early.sum()} are; an end of the task is a termination"
+        )
+
+
+def _duplicates(dataset: Dataset, found: Findings) -> None:
+    """Trajectories with the same observations and actions, which a demonstrator may mean to make."""
+    seen: dict[bytes, int] = {}
+    starts, hashes = dataset.starts, dataset.task_hashes
+    for index, (start, length) in enumerate(zip(starts, dataset.lengths, strict=True)):
+        rows = slice(int(start), int(start) + int(length))
+        digest = hashlib.blake2b(np.ascontiguousarray(dataset.obs[rows]).tobytes(), digest_size=16)
+        digest.update(np.ascontiguousarray(dataset.actions[rows]).tobytes())
+        if index % 256 == 0:
+            let_go(dataset.obs)
+        first = seen.setdefault(digest.digest(), index)
+        if first == index:
+            continue
+        text = f"trajectory {index}, step 0: all of its steps are those of trajectory {first}"
+        same_task = hashes is not None and hashes[index] == hashes[first]
+        (found.notes if same_task else found.faults)["twice"].append(text)
+
+
+def _idle_goals(dataset: Dataset, found: Findings) -> None:
+    """Trajectories in which no goal is reached, or in which goals never change."""
+    starts = dataset.starts
+    reached = np.logical_or.reduceat(dataset.goal_reached, starts)
+    changes = np.zeros(len(dataset), bool)
+    for index, (start, length) in enumerate(zip(starts, dataset.lengths, strict=True)):
+        goals = dataset.achieved_goals[int(start) : int(start) + int(length)]
+        changes[index] = length < 2 or bool((goals != goals[0]).any())
+    for kind, good, text in (
+        ("no goal", reached, "no goal is reached in it, so that its prompts have one goal alone"),
+        ("still goals", changes, "the achieved goal is the same at every step"),
+    ):
+        bad = np.flatnonzero(~good)
+        # A few may stand still; if most do, the goals are not what they should be.
+        place = found.faults if len(bad) > 0.5 * len(dataset) else found.notes
+        for index in bad.tolist():
+            place[kind].append(f"trajectory {index}, step 0: {text}")
+
+
+def described(folder: Path) -> str:
+    """What is in a dataset, for a person to read.
+
+    Raises:
+      DataError: if it is no dataset, or damaged.
+    """
+    facts = read_facts(folder)
+    dataset, manifest = load_dataset(folder, any_value=True)
+    lengths = dataset.lengths
+    quartiles = ", ".join(f"{q:g}" for q in np.percentile(lengths, [0, 25, 50, 75, 100]))
+    num = facts.num_actions
+    rows = [
+        ("dataset", f"{folder}, SHA-256 {manifest['sha256'][:16]}.."),
+        ("made by", _made_by(manifest)),
+        ("trajectories", f"{len(dataset):,} with {facts.num_steps:,} steps"),
+        (
+            "lengths",
+            f"mean {lengths.mean():.1f}; quartiles {quartiles}; horizon {facts.spec.horizon}",
+        ),
+        ("observations", f"{facts.obs_dtype}{list(facts.obs_shape)}, {_spread(dataset.obs)}"),
+        ("actions", f"{num} discrete" if num else f"{facts.action_dim} numbers in [-1, 1]"),
+        ("  spread", _counts(dataset.actions, num) if num else _spread(dataset.actions)),
+        ("goals", f"{facts.goal_dim} numbers, {_spread(dataset.achieved_goals)}"),
+        ("  reached", f"at {float(np.mean(dataset.goal_reached)):.1%} of the steps"),
+        ("returns", _returns(dataset)),
+        ("ends", _ends(dataset)),
+        ("size", _size(folder, dataset)),
+    ]
+    if facts.spec.action_low:
+        bounds = ", ".join(
+            f"[{low:g}, {high:g}]"
+            for low, high in zip(facts.spec.action_low, facts.spec.action_high, strict=True)
+        )
+        rows.insert(7, ("  were", f"{bounds} in the logs"))
+    return "\n".join(f"{name:<14}{printable(text)}" for name, text in rows)
+
+
+def _made_by(manifest: Mapping[str, Any]) -> str:
+    made = manifest.get("imported")
+    if isinstance(made, dict):
+        who = made.get("author") or made.get("by") or "somebody"
+        return f"{who}: {made.get('kind')} {made.get('source')}, goals {made.get('goal')}"
+    if "policy" in manifest:
+        return f"{manifest['policy']} in {manifest.get('env')}, seed {manifest.get('seed')}"
+    return "not known"
+
+
+def _spread(array: np.ndarray) -> str:
+    """Range, mean and standard deviation of all numbers of an array, a piece at a time."""
+    low, high, total, squares, num = np.inf, -np.inf, 0.0, 0.0, 0
+    for _, piece in _pieces(array):
+        rows = piece.astype(np.float64)
+        low, high = min(low, rows.min()), max(high, rows.max())
+        total, squares, num = total + rows.sum(), squares + (rows**2).sum(), num + rows.size
+    mean = total / num
+    std = max(squares / num - mean**2, 0.0) ** 0.5
+    return f"from {low:.4g} to {high:.4g}, mean {mean:.4g}, standard deviation {std:.4g}"
+
+
+def _counts(actions: np.ndarray, num: int) -> str:
+    shares = np.bincount(np.asarray(actions), minlength=num) / len(actions)
+    text = ", ".join(f"{index} {share:.1%}" for index, share in enumerate(shares[:20]))
+    return f"{text}, .." if num > 20 else text
+
+
+def _returns(dataset: Dataset) -> str:
+    if dataset.rewards is None:
+        return "not known, since there are no rewards"
+    returns = np.add.reduceat(np.asarray(dataset.rewards, np.float64), dataset.starts)
+    quartiles = ", ".join(f"{q:.4g}" for q in np.percentile(returns, [0, 25, 50, 75, 100]))
+    return f"mean {returns.mean():.4g}; quartiles {quartiles}"
+
+
+def _ends(dataset: Dataset) -> str:
+    if dataset.terminated is None or dataset.truncated is None:
+        return "not known"
+    neither = ~dataset.terminated & ~dataset.truncated
+    counts = (
+        ("terminated", dataset.terminated),
+        ("truncated", dataset.truncated),
+        ("neither", neither),
+    )
+    return ", ".join(f"{rows.sum()} {name}" for name, rows in counts)
+
+
+def _size(folder: Path, dataset: Dataset) -> str:
+    on_disk = sum(path.stat().st_size for path in Path(folder).iterdir() if path.is_file())
+    arrays = dataset.arrays
+    mapped = {
+        n: a
+        for n, a in arrays.items()
+        if isinstance(a, np.memmap) and n in (*STEP_ARRAYS, "rewards")
+    }
+    in_memory = sum(a.nbytes for a in arrays.values())
+    text = f"{on_disk / 1e6:,.1f} MB on disk, {in_memory / 1e6:,.1f} MB as arrays"
+    return f"{text}, which are mapped and not read" if mapped else f"{text}, which are in memory"
