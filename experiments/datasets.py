@@ -29,9 +29,10 @@ from experiments.store.provenance import provenance, versions
 from experiments.store.settings import CollectConfig, PretrainConfig, dataset_folder
 from experiments.store.work import PIECES, long_work
 from mgpo_jax.claims import check_place
-from mgpo_jax.dataset import Dataset, hash_task, load_dataset, write_dataset
+from mgpo_jax.dataset import Dataset, hash_task, load_dataset, spec_of, write_dataset
 from mgpo_jax.files import ExistsError, remove_leftovers
 from mgpo_jax.journal import Journal
+from mgpo_jax.manifest import read_facts
 from mgpo_jax.progress import Progress
 from mgpo_jax.runner import together
 from mgpo_jax.sharding import fetch
@@ -344,6 +345,38 @@ def collect_and_save(
     )
 
 
+def own_dataset(config: PretrainConfig, env: Environment | None) -> tuple[Dataset, Path, str]:
+    """A dataset that a user brought, its folder and its hash; no test task of the world is in it.
+
+    Args:
+      config: of the training.
+      env: the world that it must fit, if any.
+
+    Raises:
+      DataError: if the dataset there is damaged, does not fit or holds a test task.
+    """
+    folder = config.data.data_folder
+    assert folder is not None
+    spec = env.spec if env is not None else spec_of(read_facts(folder))
+    try:
+        dataset, manifest = load_dataset(folder, spec)
+    except DataError as error:
+        if env is None:
+            raise
+        raise DataError(f"{error}; or leave --env {config.env} out, if it is of no world") from None
+    dataset = dataset.slice(0, config.data.trajectories)
+    if env is not None and dataset.task_hashes is not None:
+        refuse_test_tasks(dataset, env, envs.find(config.env), folder)
+    return dataset, folder, manifest["sha256"]
+
+
+def refuse_test_tasks(dataset: Dataset, env: Environment, world: World, folder: Path) -> None:
+    """Raise ``DataError`` if a trajectory is of a task that is kept for test."""
+    forbidden = task_hashes(env, benchmark_tasks(env, world.num_test_tasks))
+    if dataset.task_hashes is not None and np.isin(dataset.task_hashes, forbidden).any():
+        raise DataError(f"{folder} holds a test task; remove it and collect it again")
+
+
 def prepare_dataset(
     config: PretrainConfig, world: World, env: Environment, go_on: str
 ) -> tuple[Dataset, Path, str]:
@@ -383,9 +416,7 @@ def prepare_dataset(
             f"{folder} was collected by the demonstrator with {made_with or 'no settings'}, which now "
             f"has {settings or 'none'}; remove it, and it is collected again"
         )
-    forbidden = task_hashes(env, benchmark_tasks(env, world.num_test_tasks))
-    if dataset.task_hashes is not None and np.isin(dataset.task_hashes, forbidden).any():
-        raise DataError(f"{folder} holds a test task; remove it and collect it again")
+    refuse_test_tasks(dataset, env, world, folder)
     if config.holdout >= len(dataset):
         raise UsageError(
             f"--holdout {config.holdout} leaves nothing of {len(dataset)} trajectories"

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
 from experiments.runtime import run
 from experiments.store.runs import check_start
 from experiments.store.settings import PretrainConfig, check_pretraining, pretrain_default
+from mgpo_jax.manifest import read_facts
 
 
 def main(config: PretrainConfig) -> None:
     """Pre-train the multi-goal Transformer on hindsight prompts."""
     check_pretraining(config)
     check_start(config)
+    if config.data.data_folder is not None:
+        from experiments.store.recipes import told
+
+        print(told(config, read_facts(config.data.data_folder)), file=sys.stderr)
     from experiments.training import train
 
     train(config)

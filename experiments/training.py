@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -13,11 +14,11 @@ import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
 import envs
-from envs.base import Demonstrator, Environment, Task
+from envs.base import Demonstrator, Environment, EnvSpec, Task
 from envs.episodes import run_episode
 from envs.errors import DataError, UsageError
 from envs.registry import World
-from experiments.datasets import find_demonstrator, prepare_dataset
+from experiments.datasets import find_demonstrator, own_dataset, prepare_dataset
 from experiments.figures import training_curve
 from experiments.runtime import expect_compiling
 from experiments.signals import Stopped, asked_to_stop, farewell
@@ -25,6 +26,7 @@ from experiments.store import runs
 from experiments.store.metrics import METRICS, Metrics, check_loggers, salvaged_rows
 from experiments.store.provenance import provenance
 from experiments.store.settings import (
+    NO_WORLD,
     PretrainConfig,
     check_initial,
     initial_folder,
@@ -32,9 +34,10 @@ from experiments.store.settings import (
 )
 from mgpo_jax.checkpoint import Snapshot, checkpoints, restore_state, save_state
 from mgpo_jax.claims import claimed
-from mgpo_jax.dataset import BatchPlan, Dataset
+from mgpo_jax.dataset import BatchPlan, Dataset, spec_of
 from mgpo_jax.files import remove_unfinished, to_json, written
 from mgpo_jax.kinds import KINDS, MULTI_GOAL, kind_of
+from mgpo_jax.manifest import read_facts
 from mgpo_jax.optimizers.methods import judged_query
 from mgpo_jax.policy import LoadedPolicy, transformer_policy
 from mgpo_jax.policy_files import MEND, read_policy, save_policy
@@ -42,6 +45,7 @@ from mgpo_jax.progress import Progress
 from mgpo_jax.prompts import Prompt, sample_prompt, single_goal
 from mgpo_jax.rollout import rollout
 from mgpo_jax.runner import together
+from mgpo_jax.schema import let_go
 from mgpo_jax.sharding import device_mesh, largest_divisor
 from mgpo_jax.tasks import EVAL_SEED, evaluation_tasks
 from mgpo_jax.training import Trainer, TrainState, batch_stream, diverged, finite_metrics
@@ -51,7 +55,7 @@ CONSTANT = 1e-4  # below this standard deviation a component of an observation s
 PERFECT = 1e-3  # a demonstration whose return is this near to the optimum counts as perfect
 
 
-def initial_policy(config: PretrainConfig, env: Environment) -> LoadedPolicy | None:
+def initial_policy(config: PretrainConfig, spec: EnvSpec) -> LoadedPolicy | None:
     """The policy that a run starts from; None if it starts from random weights.
 
     Raises:
@@ -61,7 +65,7 @@ def initial_policy(config: PretrainConfig, env: Environment) -> LoadedPolicy | N
     if config.init is None:
         return None
     try:
-        policy = read_policy(initial_folder(config), env.spec, config.method)
+        policy = read_policy(initial_folder(config), spec, config.method)
     except DataError as error:
         raise DataError(str(error).replace(MEND, mend_initial(config))) from None
     if (found := kind_of(policy.config).name) != config.method:
@@ -74,23 +78,55 @@ def initial_policy(config: PretrainConfig, env: Environment) -> LoadedPolicy | N
 
 
 def configured_network(
-    config: PretrainConfig, env: Environment, dataset: Dataset, init: LoadedPolicy | None = None
+    config: PretrainConfig,
+    env: Environment | None,
+    dataset: Dataset,
+    init: LoadedPolicy | None = None,
+    spec: EnvSpec | None = None,
 ) -> Any:
-    """The network of a run: that of the policy it starts from, or one of the settings both configs have."""
+    """The network of a run: that of the policy it starts from, or one of the settings both configs have.
+
+    Where there is no world, ``spec`` says what the data is like.
+    """
     if init is not None:
         return replace(init.config, dropout=config.dropout)
     learned = KINDS.find(config.method).load()
     common = {f.name for f in fields(learned.config)} & {f.name for f in fields(PretrainConfig)}
     sizes = {name: getattr(config, name) for name in common}
-    sizes |= world_side(env.spec, config.head, config.encoder)
+    spec = env.spec if env is not None else spec
+    assert spec is not None
+    sizes |= world_side(spec, config.head, config.encoder)
     network = learned.complete(learned.config(**sizes), env, dataset)
     if not config.standardize_obs:
         return network
-    rows = dataset.obs.reshape(len(dataset.obs), -1)
-    mean = rows.mean(axis=0, dtype=np.float64)
-    std = rows.std(axis=0, dtype=np.float64)
+    mean, std = moments(dataset.obs)
     std = np.where(std < CONSTANT, 1.0, std)
     return replace(network, obs_mean=tuple(mean.tolist()), obs_std=tuple(std.tolist()))
+
+
+def moments(obs: np.ndarray, piece: int = 1 << 24) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation of every component of observations, float64 [D].
+
+    They are added up in the order of the rows, ``piece`` numbers at a time: the result has the bits of
+    ``numpy.mean`` and ``numpy.std`` where D is above 1, and needs little memory beside a mapped array.
+
+    Args:
+      obs: observations [N, ...].
+      piece: how many numbers are converted at once.
+    """
+    size = int(np.prod(obs.shape[1:], dtype=np.int64))
+    step = max(1, piece // size)
+
+    def total(of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        found = np.zeros(size)
+        for first in range(0, len(obs), step):
+            rows = of(np.asarray(obs[first : first + step]).reshape(-1, size).astype(np.float64))
+            found = np.add.reduce(np.concatenate([found[None], rows]), axis=0)
+            let_go(obs)
+        return found
+
+    mean = total(lambda rows: rows) / len(obs)
+    return mean, np.sqrt(total(lambda rows: np.square(rows - mean)) / len(obs))
 
 
 class ReturnsOnTheWay:
@@ -109,22 +145,20 @@ class ReturnsOnTheWay:
         world: World,
         env: Environment,
         network: TransformerConfig,
-        demonstrator: Demonstrator,
+        demonstrator: Demonstrator | None,
         num: int,
     ) -> None:
-        place = demonstrator.env or env
+        place = (demonstrator.env if demonstrator else None) or env
         self.tasks = evaluation_tasks(place, num, world.num_test_tasks, tested=env)
         self.optimum = jax.jit(jax.vmap(place.optimal_return))(self.tasks)
         self.keys = jax.random.split(jax.random.key(EVAL_SEED), (3, num))
-        variants = np.asarray(jax.vmap(demonstrator.variant)(self.tasks))
-        self._variants = {
-            f"_{name}": variants == index for index, name in enumerate(demonstrator.variants)
-        }
+        self._variants = _variants(demonstrator, self.tasks)
         num_slots = network.max_prompt_length
 
         def demonstrated(
             key: PRNGKeyArray, key_prompt: PRNGKeyArray, task: Task, weights: Any
         ) -> tuple[Prompt, Array]:
+            assert demonstrator is not None  # else nothing is demonstrated
             episode = run_episode(key, place, demonstrator.agent(weights), task)
             goals = episode.trajectory.goals
             confirmed = goals.goal_reached & (episode.rewards > 0)
@@ -141,9 +175,8 @@ class ReturnsOnTheWay:
             self.tasks
         )
         self._perfect = np.zeros(num, bool)
-        if np.isfinite(
-            self.optimum
-        ).all():  # elsewhere nobody knows which demonstrations are perfect
+        # Elsewhere nobody demonstrates, or nobody knows which demonstrations are perfect.
+        if demonstrator is not None and np.isfinite(self.optimum).all():
             demonstrate = together(place, demonstrated, in_axes=(0, 0, 0, None))
             self._followed, returns = demonstrate(
                 self.keys[0], self.keys[1], self.tasks, demonstrator.weights
@@ -166,6 +199,14 @@ class ReturnsOnTheWay:
         """The mean of what counts, of all tasks and of those of each variant."""
         groups = {"": counts, **{tail: counts & one for tail, one in self._variants.items()}}
         return {name + tail: float(values[one].mean()) for tail, one in groups.items() if one.any()}
+
+
+def _variants(demonstrator: Demonstrator | None, tasks: Task) -> dict[str, np.ndarray]:
+    """Which tasks are of which variant of the world, by the ends of the names of metrics."""
+    if demonstrator is None:
+        return {}
+    variants = np.asarray(jax.vmap(demonstrator.variant)(tasks))
+    return {f"_{name}": variants == index for index, name in enumerate(demonstrator.variants)}
 
 
 class ReturnsByItself:
@@ -193,7 +234,7 @@ def watched(
     world: World,
     env: Environment,
     network: NetworkConfig,
-    demonstrator: Demonstrator,
+    demonstrator: Demonstrator | None,
     num: int,
 ) -> Callable[[Any], dict[str, float]]:
     """``(params) -> returns`` that a training watches on ``num`` tasks."""
@@ -210,24 +251,28 @@ class Run:
 
     def __init__(self, config: PretrainConfig, go_on: str) -> None:
         self.config, self.folder = config, config.folder
-        world, env = envs.find(config.env), envs.make(config.env)
-        self.init = init = initial_policy(config, env)
-        world_side(env.spec, config.head, config.encoder)  # complains about a bad head or encoder
+        env = None if config.env == NO_WORLD else envs.make(config.env)
+        own = config.data.data_folder
+        spec = env.spec if env is not None else spec_of(read_facts(own or Path()))
+        self.init = init = initial_policy(config, spec)
+        world_side(spec, config.head, config.encoder)  # complains about a bad head or encoder
         check_loggers(config)
         meta = provenance()
-        dataset, place, sha256 = prepare_dataset(config, world, env, go_on)
-        self.network = configured_network(config, env, dataset, init)
+        dataset, place, sha256 = (
+            prepare_dataset(config, envs.find(config.env), env, go_on)
+            if own is None and env is not None
+            else own_dataset(config, env)
+        )
+        self.network = configured_network(config, env, dataset, init, spec)
         self.mesh = device_mesh(largest_divisor(config.train.part_size, len(jax.devices())))
         cut = len(dataset) - config.holdout
         self.fit, held_out = dataset.slice(0, cut), dataset.slice(cut, len(dataset))
         self.trainer = Trainer(config.train, self.network, self.fit, self.mesh)
         self._held_out = held_out
-        self.truncate = env.spec.truncate_in_hindsight
-        self._held_out_parts = self._validation_parts(held_out, env.spec.horizon)
-        _, demonstrator = find_demonstrator(world, env, config.data.demonstrator)
-        self._returns_on_the_way = watched(
-            world, env, self.network, demonstrator, config.eval_tasks
-        )
+        self.truncate = spec.truncate_in_hindsight
+        longest = spec.horizon if own is None else int(dataset.lengths.max())
+        self._held_out_parts = self._validation_parts(held_out, longest)
+        self._returns_on_the_way = self._watched(env)
         self.identity = runs.identity(config, sha256, init.sha256 if init else "")
         meta = {**meta, "dataset": str(place), "dataset_sha256": sha256, **self.origin}
         if runs.has_begun(self.folder):
@@ -235,6 +280,19 @@ class Run:
             runs.keep_initial(config, meta)
         else:  # only now, after everything that could be wrong with the settings
             runs.begin(config, meta)
+
+    def _watched(self, env: Environment | None) -> Callable[[Any], dict[str, float]]:
+        """What is measured in the world on the way; nothing where there is none."""
+        if env is None:
+            return lambda params: {}
+        config, world = self.config, envs.find(self.config.env)
+        own = config.data.data_folder is not None
+        demonstrator = (
+            None
+            if own and not world.demonstrators(env)
+            else find_demonstrator(world, env, config.data.demonstrator)[1]
+        )
+        return watched(world, env, self.network, demonstrator, config.eval_tasks)
 
     @property
     def origin(self) -> dict[str, str]:

@@ -141,13 +141,14 @@ def _write_policy(
 
 
 def load_policy(
-    world: World | str, path: Path | str | None = None, kind: str = MULTI_GOAL
+    world: World | str | None = None, path: Path | str | None = None, kind: str = MULTI_GOAL
 ) -> LoadedPolicy:
     """The policy in a folder (default: the released one), checked against the world.
 
     Args:
-      world: the world, its name, or its place as ``module:attribute``.
-      path: folder of a policy.
+      world: the world, its name, or its place as ``module:attribute``; None for a policy that was trained
+        on data of no world, which is checked by itself alone.
+      path: folder of a policy; without a world it has to be given.
       kind: the kind of network that it must be (default: one that follows prompts).
 
     Raises:
@@ -155,15 +156,23 @@ def load_policy(
       DataError: if the files are damaged or do not fit the world.
     """
     world = find(world) if isinstance(world, str) else world
-    folder = Path(path) if path else released_folder(world, kind)
-    policy = read_policy(folder, world.make().spec, kind)
+    if world is None and not path:
+        raise UsageError("name a world, or give the folder of a policy as path")
+    folder = Path(path) if path else released_folder(_there(world), kind)
+    policy = read_policy(folder, None if world is None else world.make().spec, kind)
     found = kind_of(policy.config).name
     if found != kind:
         raise UsageError(
             f"the network in {folder} is of the kind {found}, one of the kind {kind} is needed; train it "
-            f"with `python -m experiments.pretrain --env {world.name}{method_flag(kind)}`"
+            f"with `python -m experiments.pretrain --env {world.name if world else 'WORLD'}"
+            f"{method_flag(kind)}`"
         )
     return policy
+
+
+def _there(world: World | None) -> World:
+    assert world is not None  # as the caller has seen to
+    return world
 
 
 def method_flag(kind: str) -> str:

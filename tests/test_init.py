@@ -144,7 +144,7 @@ def test_the_first_step_starts_from_the_weights_of_the_policy(here: Path) -> Non
     """Moments and schedule start afresh; the network is that of the policy, but for its dropout."""
     config = parsed(f"{ON} --dropout 0.25")
     first = read_policy(Path("first/policy"))
-    init = training.initial_policy(config, training.envs.make("maze15"))
+    init = training.initial_policy(config, training.envs.make("maze15").spec)
     assert init is not None
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training.runs, "has_begun", lambda folder: False)

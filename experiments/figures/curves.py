@@ -89,7 +89,10 @@ def training_curve(rows: Sequence[Mapping[str, Any]]) -> Figure:
         ),
     )
     colors = (METHODS["bpe"].color, METHODS["ucb"].color)
-    for ax, (ylabel, names) in zip(figure.subplots(1, 2), panels, strict=True):
+    # A training on data of no world has no returns.
+    drawn = [panel for panel in panels if any(name in row for name in panel[1] for row in rows)]
+    axes = figure.subplots(1, max(1, len(drawn)), squeeze=False)[0]
+    for ax, (ylabel, names) in zip(axes, drawn, strict=False):
         for (name, label), color in zip(names.items(), colors, strict=True):
             if any(name in row for row in rows):
                 values = [row.get(name, np.nan) for row in rows]

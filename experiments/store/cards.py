@@ -16,7 +16,7 @@ from experiments.datasets import find_demonstrator
 from experiments.figures import training_curve
 from experiments.store.metrics import METRICS, RESUME, read_metrics
 from experiments.store.provenance import read_meta
-from experiments.store.settings import INIT, PretrainConfig, pretraining_from
+from experiments.store.settings import INIT, NO_WORLD, PretrainConfig, pretraining_from
 from mgpo_jax.dataset import variant_counts
 from mgpo_jax.files import new_folder, write_text
 from mgpo_jax.kinds import MULTI_GOAL, Kind, kind_of
@@ -93,6 +93,11 @@ def read_run(source: Path, env: str | None = None) -> Finished:
     name, settings = policy.made.get("env"), policy.made.get("config")
     if name is None or not isinstance(settings, dict):
         raise DataError(f"{path} lacks made.env or made.config; {RESUME}")
+    if name == NO_WORLD:
+        raise UsageError(
+            f"{source} was trained on data of no world, for which nothing is released; copy the folder "
+            f"{source / 'policy'}, which is complete, and load it with mgpo_jax.load_policy(path=...)"
+        )
     world = WORLDS.known(name, path, "--env")
     if given is not None and given is not world:
         raise UsageError(f"--env {env}, but the policy in {source} was made for {name}")

@@ -21,6 +21,7 @@ from typing import Any
 
 from envs.errors import DataError, UsageError, printable, shown
 from experiments.store.settings import (
+    DEFAULT_WORLD,
     INIT,
     PretrainConfig,
     goes_on,
@@ -100,7 +101,7 @@ def identity(config: PretrainConfig, dataset_sha256: str, init_sha256: str = "")
       dataset_sha256: the hash of its dataset.
       init_sha256: that of the weights that it starts from; empty for random ones.
     """
-    usual = training_settings(PretrainConfig())
+    usual = training_settings(PretrainConfig(env=DEFAULT_WORLD))
     # Those that have their defaults are left out, so that settings which are added later change nothing.
     settings = {k: v for k, v in training_settings(config).items() if v != usual[k]}
     hashes = [dataset_sha256, init_sha256] if init_sha256 else [dataset_sha256]

@@ -22,6 +22,7 @@ from envs.errors import DataError, UsageError, nearest, shown
 from experiments.runtime import Common
 from experiments.store.layout import CONFIG
 from mgpo_jax.kinds import KINDS, MULTI_GOAL
+from mgpo_jax.manifest import read_facts
 from mgpo_jax.methods import NoHyper
 from mgpo_jax.schema import STRICT, Json, Sha256, read_document
 from mgpo_jax.settings import (
@@ -53,6 +54,8 @@ from mgpo_jax.settings import (
 
 RUNS = Path("runs")
 DEFAULT_WORLD = "maze15"
+NO_WORLD = "none"
+"""What ``--env`` of a training is called on data that no world is registered for."""
 
 
 def data_root() -> Path:
@@ -96,14 +99,18 @@ class DataConfig:
     """Trajectories to train on; they are collected first where they are not there yet."""
     data_seed: Seed = 0
     """Seed of the dataset."""
+    data_folder: Annotated[Path | None, tyro.conf.arg(aliases=("--data",))] = None
+    """Folder of a dataset of your own (``python -m experiments.data import``) to train on; it needs no
+    world."""
 
 
 @dataclass(frozen=True)
 class PretrainConfig(Common):
     """Settings of ``experiments.pretrain``; values in brackets are the paper's."""
 
-    env: Name = DEFAULT_WORLD
-    """The world, by name or as module:attribute (``python -m experiments.list`` shows the names)."""
+    env: Name = NO_WORLD
+    """The world, by name or as module:attribute (``python -m experiments.list`` shows the names). With
+    ``--data`` the default is none: nothing is evaluated on the way then."""
     method: Name = MULTI_GOAL
     """The kind of network: mgpo follows prompts, ptgm and spirl are the low levels of those methods."""
     preset: Name = "fast"
@@ -158,7 +165,9 @@ class PretrainConfig(Common):
     def folder(self) -> Path:
         method = "" if self.method == MULTI_GOAL else f"{file_name(self.method)}-"
         name = f"{method}{self.preset}-seed{self.train.seed}"
-        return self.out or RUNS / "pretrain" / file_name(self.env) / name
+        data = self.data.data_folder
+        place = data.absolute().name if data and self.env == NO_WORLD else file_name(self.env)
+        return self.out or RUNS / "pretrain" / place / name
 
 
 def file_name(name: str) -> str:
@@ -237,13 +246,34 @@ def pretrain_default(config: PretrainConfig, flags: Iterable[str] = ()) -> Pretr
       UsageError: if there is no such world, preset or policy.
       DataError: if the config of the policy is damaged, or that of a run that is resumed.
     """
-    default = pretrain_preset(config.env, config.preset, config.method)
+    default = _preset_of(config)
     if config.init is None:
         return default
     if goes_on(config):
         run = saved_pretraining(config.folder / CONFIG)
         return with_settings(default, {name: getattr(run, name) for name in OF_INITIAL})
     return with_settings(default, read_initial(config).network)
+
+
+def _preset_of(config: PretrainConfig) -> PretrainConfig:
+    """The defaults of a world, or those for data of one's own."""
+    from experiments.store import recipes  # which needs the settings
+
+    folder = config.data.data_folder
+    if folder is None:
+        env = DEFAULT_WORLD if config.env == NO_WORLD else config.env
+        return pretrain_preset(env, config.preset, config.method)
+    facts = read_facts(folder)
+    if config.env != NO_WORLD:
+        default = pretrain_preset(config.env, config.preset, config.method)
+        return with_settings(default, recipes.of_data(facts, default.holdout))
+    if config.preset not in PRESETS:
+        raise nearest(config.preset, PRESETS, "preset")
+    default = with_settings(
+        PretrainConfig(preset=config.preset, method=config.method), recipes.recipe(facts)
+    )
+    default = with_settings(default, PRESETS[config.preset])
+    return with_settings(default, recipes.of_data(facts, default.holdout))
 
 
 INIT = "init"
@@ -325,6 +355,7 @@ def initial_at(folder: Path, mend: str = MEND_INIT) -> Initial:
 def check_pretraining(config: PretrainConfig) -> None:
     """Raise ``UsageError`` for settings of a training that are right by themselves, but not together."""
     train, trajectories = config.train, config.data.trajectories
+    _check_own_data(config)
     if train.batch_size % train.part_size:
         raise UsageError(
             f"--batch-size {train.batch_size} is not a multiple of --part-size {train.part_size}"
@@ -347,6 +378,29 @@ def check_pretraining(config: PretrainConfig) -> None:
         )
 
 
+def _check_own_data(config: PretrainConfig) -> None:
+    """Raise ``UsageError`` for settings that have no use with data of one's own, or need it."""
+    data = config.data
+    if data.data_folder is None:
+        if config.env == NO_WORLD:
+            raise UsageError(
+                f"--env {NO_WORLD} is for data of your own; give its folder with --data, or name a world"
+            )
+        return
+    if data.demonstrator is not None or data.data_seed:
+        name = "--data-seed" if data.demonstrator is None else "--demonstrator"
+        raise UsageError(f"--data is collected already: {name} has no use beside it; leave it out")
+    if config.env == NO_WORLD and config.method != MULTI_GOAL:
+        raise UsageError(
+            f"--method {config.method} needs a world; name the one that the data is from with --env"
+        )
+    num = read_facts(data.data_folder).num_trajectories
+    if data.trajectories > num:
+        raise UsageError(
+            f"--trajectories {data.trajectories} is more than the {num} in {data.data_folder}; lower it"
+        )
+
+
 def check_initial(config: PretrainConfig) -> None:
     """Raise ``UsageError`` for settings of a network that the policy to start from was not made for."""
     folder, network = initial_folder(config), read_initial(config).network
@@ -358,11 +412,11 @@ def check_initial(config: PretrainConfig) -> None:
 NO_SETTINGS = frozenset(
     {
         "preset", "init", "out", "resume", "debug", "quiet", "config", "dry_run", "tb", "wandb",
-        "eval_every", "save_every",
+        "eval_every", "save_every", "data_folder",
     }
 )  # fmt: skip
-"""Settings that may differ when a run is resumed: they do not change its weights. For the place of the
-policy to start from, the hash of its weights counts."""
+"""Settings that may differ when a run is resumed: they do not change its weights. For the places of data
+and of the policy to start from, their hashes count."""
 
 
 def training_settings(config: PretrainConfig) -> dict[str, Any]:
