@@ -32,7 +32,7 @@ from mgpo_jax.claims import check_place
 from mgpo_jax.dataset import Dataset, hash_task, load_dataset, spec_of, write_dataset
 from mgpo_jax.files import ExistsError, remove_leftovers
 from mgpo_jax.journal import Journal
-from mgpo_jax.manifest import read_facts
+from mgpo_jax.manifest import mend_for, read_facts
 from mgpo_jax.progress import Progress
 from mgpo_jax.runner import together
 from mgpo_jax.sharding import fetch
@@ -363,7 +363,8 @@ def own_dataset(config: PretrainConfig, env: Environment | None) -> tuple[Datase
     except DataError as error:
         if env is None:
             raise
-        raise DataError(f"{error}; or leave --env {config.env} out, if it is of no world") from None
+        mend = f"import it again as it is in {config.env}, or leave --env out if it is of no world"
+        raise DataError(str(error).replace(mend_for(folder), mend)) from None
     dataset = dataset.slice(0, config.data.trajectories)
     if env is not None and dataset.task_hashes is not None:
         refuse_test_tasks(dataset, env, envs.find(config.env), folder)

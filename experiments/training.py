@@ -46,9 +46,17 @@ from mgpo_jax.prompts import Prompt, sample_prompt, single_goal
 from mgpo_jax.rollout import rollout
 from mgpo_jax.runner import together
 from mgpo_jax.schema import let_go
+from mgpo_jax.settings import TrainConfig
 from mgpo_jax.sharding import device_mesh, largest_divisor
 from mgpo_jax.tasks import EVAL_SEED, evaluation_tasks
-from mgpo_jax.training import Trainer, TrainState, batch_stream, diverged, finite_metrics
+from mgpo_jax.training import (
+    Trainer,
+    TrainState,
+    batch_stream,
+    diverged,
+    finite_metrics,
+    learning_rate_schedule,
+)
 from mgpo_jax.transformer import NetworkConfig, TransformerConfig, world_side
 
 CONSTANT = 1e-4  # below this standard deviation a component of an observation stays unscaled
@@ -278,8 +286,14 @@ class Run:
         if runs.has_begun(self.folder):
             runs.check_same(config, meta)
             runs.keep_initial(config, meta)
+            if (trained := runs.prolonged(config)) is not None:
+                runs.note_prolonged(config, trained)
+                kept = runs.kept_policy(self.folder, trained)
+                text = _how_it_goes_on(config.train, trained)
+                print(f"{text}; the policy so far is kept in {kept}", file=sys.stderr)
         else:  # only now, after everything that could be wrong with the settings
             runs.begin(config, meta)
+        self.identities = runs.identities(config, sha256, init.sha256 if init else "")
 
     def _watched(self, env: Environment | None) -> Callable[[Any], dict[str, float]]:
         """What is measured in the world on the way; nothing where there is none."""
@@ -353,14 +367,14 @@ def train(config: PretrainConfig, go_on: str = "continue with --resume") -> None
         remove_unfinished(folder)
         if runs.has_begun(folder):
             runs.check_start(config)
-            if runs.is_finished(folder):
+            if runs.is_finished(folder) and runs.prolonged(config) is None:
                 print(f"{folder} is finished already", file=sys.stderr)
                 return
         expect_compiling()
         run = Run(config, go_on)
         with checkpoints(run.folder / runs.CHECKPOINTS) as manager:
             blank = run.initial_state()
-            before = restore_state(manager, blank, run.identity) if config.resume else None
+            before = restore_state(manager, blank, run.identities) if config.resume else None
             before = before or Snapshot(blank, [], [])
             rows = before.measured
             if rows is None:  # a checkpoint of an older version
@@ -377,6 +391,19 @@ def train(config: PretrainConfig, go_on: str = "continue with --resume") -> None
         with written(run.folder / runs.PICTURE) as picture:
             training_curve(metrics.rows).savefig(picture)
     print(f"policy written to {policy}", file=sys.stderr)
+
+
+def _how_it_goes_on(config: TrainConfig, trained: int) -> str:
+    """What a finished run does that takes more steps, in words.
+
+    Its learning rate is that of a run of the new length from the start, so that it usually rises.
+    """
+    rate = float(learning_rate_schedule(config)(trained))
+    falls = "falls along the same cosine" if config.schedule == "cosine" else "stays there"
+    return (
+        f"the run has {trained:,} steps and goes on to {config.steps:,}: the learning rate is that of a "
+        f"training of {config.steps:,} steps, {rate:.3g} at first, and {falls}"
+    )
 
 
 def _take_steps(

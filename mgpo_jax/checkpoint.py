@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import logging
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from itertools import chain, count
 from pathlib import Path
@@ -98,11 +98,12 @@ def _named_leaves(state: TrainState) -> dict[str, np.ndarray]:
 
 
 def restore_state(
-    manager: ocp.CheckpointManager, blank: TrainState, identity: str = ""
+    manager: ocp.CheckpointManager, blank: TrainState, identity: str | Collection[str] = ""
 ) -> Snapshot | None:
     """The newest sound checkpoint, or None if there is none.
 
-    Those that are damaged are set aside, with a line on stderr that says so.
+    Those that are damaged are set aside, with a line on stderr that says so. ``identity`` is that of the
+    run, or those that it may have; empty where any is right.
 
     Raises:
       DataError: if it is of another run or another network.
@@ -119,7 +120,8 @@ def restore_state(
             _set_aside(where, root.with_name(root.name + DAMAGED))
             manager.reload()  # else it refuses to save steps up to the one that is gone
             continue
-        if identity and _IDENTITY in found and found[_IDENTITY].tobytes().hex() != identity:
+        known = [identity] if isinstance(identity, str) else identity
+        if identity and _IDENTITY in found and found[_IDENTITY].tobytes().hex() not in known:
             raise DataError(
                 f"checkpoint {where} is of a run with other settings or data; remove {root} to train "
                 "from the first step"

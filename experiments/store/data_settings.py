@@ -11,6 +11,7 @@ from annotated_types import Ge, Le
 
 from envs.errors import UsageError
 from experiments.runtime import Common
+from mgpo_jax.schema import Name as WorldName
 from mgpo_jax.settings import Count, Index, Name
 
 Number = Annotated[float, Ge(-1e18), Le(1e18)]
@@ -58,7 +59,7 @@ class ImportConfig(Common):
     """Whether a trajectory that is cut at any step shows how to reach another goal."""
     skip_bad: bool = False
     """Leave episodes out that hold NaN or infinity, or are longer than the horizon."""
-    name: Name | None = None
+    name: WorldName | None = None
     """What messages call the world that the logs are from (default: the name of the source)."""
 
 

@@ -16,6 +16,7 @@ import shutil
 import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence, Set
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,12 +33,20 @@ from experiments.store.settings import (
     training_settings,
 )
 from mgpo_jax.claims import LOCK, check_place
-from mgpo_jax.files import TEMPORARY, hash_file, remove_unfinished, write_json, written
+from mgpo_jax.files import (
+    TEMPORARY,
+    hash_file,
+    new_folder,
+    remove_unfinished,
+    write_json,
+    written,
+)
 from mgpo_jax.schema import Json, read_document
 
 CONFIG, META, CHECKPOINTS, POLICY = "config.json", "meta.json", "checkpoints", "policy"
 PICTURE, WEIGHTS = "training.png", "weights.npz"
 OLD_PARTIAL = "config.json.partial"  # what older versions were writing when they were killed
+PROLONGED = "prolonged_after"  # the entry of META with the steps after which a run took more
 ROOM = 32 << 20  # bytes that must be free before a training starts: a few small checkpoints
 
 
@@ -145,11 +154,66 @@ def keep_initial(config: PretrainConfig, meta: Mapping[str, Any]) -> None:
         raise DataError(f"the policy in {source} was replaced just now; run the same command again")
 
 
+def steps_trained(folder: Path) -> int:
+    """How many gradient steps the policy of a finished run has taken; 0 where there is none.
+
+    Raises:
+      DataError: if the config of the policy is damaged.
+    """
+    if not is_finished(folder):
+        return 0
+    path = folder / POLICY / CONFIG
+    document = read_document(path, dict[str, Json], "train it again")
+    made = document.get("made")
+    steps = made.get("steps") if isinstance(made, dict) else None
+    return steps if isinstance(steps, int) else saved_pretraining(folder / CONFIG).train.steps
+
+
+def prolonged(config: PretrainConfig) -> int | None:
+    """The number of steps that a finished run had, if it is resumed to take more; None elsewhere."""
+    folder = config.folder
+    if not (goes_on(config) and (trained := steps_trained(folder))):
+        return None
+    return trained if trained < config.train.steps else None
+
+
+def kept_policy(folder: Path, trained: int) -> Path:
+    """Where the policy of a run is kept that takes more steps than it was trained for."""
+    return folder / f"{POLICY}-{trained}"
+
+
+def note_prolonged(config: PretrainConfig, trained: int) -> None:
+    """Note that a finished run takes more steps, and keep a copy of the policy that it has.
+
+    The new settings are written last, so that a process that is killed before can begin again.
+    """
+    kept = kept_policy(config.folder, trained)
+    if not kept.exists():
+        with new_folder(kept) as place:
+            shutil.copytree(config.folder / POLICY, place, dirs_exist_ok=True)
+    meta = _saved_meta(config.folder)
+    before = [steps for steps in meta.get(PROLONGED, []) if isinstance(steps, int)]
+    write_json(config.folder / META, {**meta, PROLONGED: sorted({*before, trained})})
+    write_json(config.folder / CONFIG, config)
+
+
+def identities(config: PretrainConfig, dataset_sha256: str, init_sha256: str = "") -> list[str]:
+    """The hashes that checkpoints of a run may have: its own, and those from before it was prolonged."""
+    before = _saved_meta(config.folder).get(PROLONGED, []) if goes_on(config) else []
+    runs = [replace(config, train=replace(config.train, steps=steps)) for steps in before]
+    return [identity(one, dataset_sha256, init_sha256) for one in (config, *runs)]
+
+
 def check_settings(config: PretrainConfig) -> None:
-    """Raise ``UsageError`` if a run that is resumed was started with other settings or other weights."""
+    """Raise ``UsageError`` if a run that is resumed was started with other settings or other weights.
+
+    A finished run may take more steps.
+    """
     folder = config.folder
     saved = saved_pretraining(folder / CONFIG)
     before, now = training_settings(saved), training_settings(config)
+    if prolonged(config) == saved.train.steps:
+        before |= {"steps": config.train.steps}
     if starts_elsewhere(saved, config):
         before |= {"init": saved.init and str(saved.init)}
         now |= {"init": config.init and str(config.init)}

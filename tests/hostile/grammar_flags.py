@@ -26,7 +26,7 @@ from .grammar_json import NAMES
 
 ZERO_IS_FINE = {
     "seed", "data-seed", "warmup-steps", "weight-decay", "dropout", "obs-noise", "action-noise", "c",
-    "tasks",
+    "tasks", "goal-columns", "action-low", "action-high",
 }  # fmt: skip
 """Numbers of these flags count from 0."""
 
@@ -40,6 +40,7 @@ BASE: dict[str, tuple[str, tuple[str, ...]]] = {
     "list": ("", ()),
     "info": ("", ()),
     "collect": ("--env gridworld --trajectories 4 --out new", ()),
+    "data": ("import flat.npz --goal-columns 0 --out new", ("flat.npz",)),
     "pretrain": (
         "--preset smoke --trajectories 40 --holdout 8 --embed-dim 8 --num-layers 1 --batch-size 8 "
         "--part-size 4 --bucket 64 --eval-tasks 2 --steps 4 --out new",
@@ -92,6 +93,22 @@ CONTRADICTIONS: dict[str, tuple[tuple[str, str], ...]] = {
         ("--encoder cells --standardize-obs", "--standardize-obs"),
         ("--tokens-per-step 3", "--tokens-per-step"),
         ("--init result", "result"),
+        ("--data nowhere", "nowhere"),
+        ("--data policy", "policy"),
+        ("--env none", "--data"),
+    ),
+    "data": (
+        ("export nowhere --out new.npz", "nowhere"),
+        ("check nowhere", "nowhere"),
+        ("info policy", "policy"),
+        ("--goal-columns 7", "--goal-columns"),
+        ("--goal-columns 0 0", "--goal-columns"),
+        ("--goal-array nothing --goal-columns 0", "--goal-columns"),
+        ("--goal half", "--goal"),
+        ("--action-low 0", "--action-low"),
+        ("--action-low 1 --action-high 0", "--action-low"),
+        ("--horizon 1", "horizon"),
+        ("--num-actions 1", "--num-actions"),
     ),
     "adapt": (
         ("--validation", "--tasks"),
@@ -166,6 +183,7 @@ CONTRADICTIONS: dict[str, tuple[tuple[str, str], ...]] = {
 
 VALID: dict[str, tuple[str, ...]] = {
     "collect": ("--env maze15", "--demonstrator astar4 --env maze15", "--env=maze15"),
+    "data": ("--goal-columns=1", "--reached changes", "--horizon 9 --skip-bad", "--name toy"),
     "pretrain": (
         "--head categorical",
         "--part-size 8",
@@ -282,6 +300,8 @@ def flags_of(config_class: type) -> list[Flag]:
 def config_class(command: str) -> type:
     """The settings of a command, by the convention that ``collect`` has a ``CollectConfig``."""
     module = importlib.import_module(f"experiments.{command}")
+    if command == "data":  # its lines are imports
+        return typing.cast(type, module.ImportConfig)
     return getattr(module, f"{command.capitalize()}Config")
 
 
@@ -462,7 +482,9 @@ def _contradiction(rng: np.random.Generator, command: str) -> Case:
     text, name = pick(rng, CONTRADICTIONS[command])
     added = text.split()
     words = base_words(command)
-    if not added[0].startswith("-"):  # another word in place of the first
+    if command == "data" and not added[0].startswith("-"):
+        words = added  # another command of it
+    elif not added[0].startswith("-"):  # another word in place of the first
         words = words[1:] if words and not words[0].startswith("-") else words
         words = [*added, *words]
     else:

@@ -103,6 +103,12 @@ def _make() -> None:
     run("adapt", ADAPT)
     _judge_by_sampling(Path("result"))
     shutil.copytree("result", "old/maze15/table4/K1-1seeds")
+    np.savez(
+        "flat.npz",
+        observations=np.arange(12.0).reshape(6, 2),
+        actions=np.arange(6) % 3,
+        lengths=np.array([2, 4]),
+    )
     Path("file.txt").write_text("a file\n")
     Path("trap.py").write_text(TRAP)
     Path("empty").mkdir()
