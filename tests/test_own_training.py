@@ -10,7 +10,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from hostile.work import Evaluation
+from hostile.work import Evaluation, WorkBegan, begin
 from jax.experimental.compilation_cache import compilation_cache
 
 from experiments import runtime, training
@@ -22,6 +22,7 @@ from mgpo_jax import Actor, Dataset, load_policy, save_dataset
 from mgpo_jax.manifest import Facts, SpecEntry, read_facts
 from mgpo_jax.policy_files import read_policy
 from mgpo_jax.settings import check_settings
+from mgpo_jax.training import Trainer
 
 HORIZON = 12
 SIZES = (
@@ -194,11 +195,12 @@ def test_the_data_of_a_run_must_stay_what_it_was(here, capsys):
         Path("other"), make_data(seed=1), {"spec": {"name": "arm", "horizon": 12}}, mapped=True
     )
     assert pretrain(f"{more.replace('moved', 'other')} --out first --resume") == 1
-    assert "was trained on mine with the hash" in capsys.readouterr().err
+    assert "was trained on 'mine' with the hash" in capsys.readouterr().err
     assert pretrain(f"{more} --out first --resume") == 0
 
 
-def test_with_a_world_its_shapes_and_recipe_hold(here, capsys, monkeypatch):
+@pytest.mark.parametrize("slow", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_with_a_world_its_shapes_and_recipe_hold(here, capsys, monkeypatch, slow):
     """Logs of a world are watched in it, also where it has no demonstrators."""
     monkeypatch.syspath_prepend(Path(__file__).parent)
     rng = np.random.default_rng(0)
@@ -214,6 +216,12 @@ def test_with_a_world_its_shapes_and_recipe_hold(here, capsys, monkeypatch):
     )
     save_dataset(Path("doors"), dataset, {}, mapped=True)
     words = f"--env own_world:UNSHOWN --data doors {SIZES} {STEPS} --eval-tasks 2 --out doors-run"
+    if not slow:  # as far as the first step, whose program takes long to compile
+        monkeypatch.setattr(Trainer, "step", begin)
+        with pytest.raises(WorkBegan):
+            pretrain(words)
+        assert json.loads(Path("doors-run/config.json").read_text())["env"] == "own_world:UNSHOWN"
+        return
     assert pretrain(words) == 0
     assert "--holdout 2" in capsys.readouterr().err
     policy = load_policy("own_world:UNSHOWN", "doors-run/policy")

@@ -250,6 +250,11 @@ def check_same(config: PretrainConfig, meta: dict[str, Any]) -> None:
         return
     hash_before, hash_now = saved.get("dataset_sha256"), meta["dataset_sha256"]
     if hash_before not in (None, hash_now):
+        if (place := saved.get("dataset")) != meta["dataset"]:
+            raise DataError(
+                f"{folder} was trained on {shown(place)} with the hash {shown(hash_before)[:13]}.., "
+                f"{meta['dataset']} has {hash_now[:12]}..; give the same data, or start a new run with --out"
+            )
         raise DataError(
             f"{folder} was trained on {meta['dataset']} with the hash {shown(hash_before)[:13]}.., which "
             f"now has {hash_now[:12]}..; collect it again as it was, or start a new run with --out"
