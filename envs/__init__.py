@@ -1,4 +1,5 @@
-"""The worlds: ``envs.make("maze15")`` builds one, ``envs.names()`` lists them.
+"""The worlds: ``envs.make("maze15")`` builds one, ``envs.names()`` lists them, and
+``envs.check_world(world)`` checks one of your own.
 
 Importing this package imports no jax; the records of an episode are loaded when they are first used.
 """
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
         TimeStep,
         Trajectory,
     )
+    from envs.checks import check_world
 
 __all__ = [
     "Agent",
@@ -38,6 +40,7 @@ __all__ = [
     "TimeStep",
     "Trajectory",
     "World",
+    "check_world",
     "find",
     "make",
     "names",
@@ -46,6 +49,10 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
+    if name == "check_world":
+        from envs.checks import check_world
+
+        return check_world
     if name in __all__:
         from envs import base
 

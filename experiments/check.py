@@ -1,7 +1,12 @@
-"""Compare a world with its official program: ``python -m experiments.check RUN_DIR --out FILE.json``."""
+"""Check a world, or compare one with its official program under optimized prompts.
+
+``python -m experiments.check my_package.my_world:WORLD`` and ``python -m experiments.check RUN_DIR``.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +15,9 @@ from typing import Any, NoReturn
 
 import tyro
 
-from experiments.runtime import Common, refuse_existing_file, require_runs, run, say
+import envs
+from envs.errors import DataError, UsageError
+from experiments.runtime import Common, refuse_existing_file, run, say
 from experiments.signals import farewell
 from mgpo_jax.settings import Name
 
@@ -20,7 +27,8 @@ class CheckConfig(Common):
     """Settings of ``experiments.check``."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]] = ()
-    """Result folders of adaptations."""
+    """Worlds to check, by name or as module:attribute; or result folders of adaptations, whose worlds are
+    compared with their official programs."""
     env: Name | None = None
     """World to compare with its official program (default: where the prompts were found)."""
     policy: Path | None = None
@@ -30,10 +38,67 @@ class CheckConfig(Common):
 
 
 def main(config: CheckConfig) -> None:
-    """Act greedily under optimized prompts in a world and in its official program, and compare."""
-    require_runs(config.runs, "check")
+    """Check whether worlds keep what every world promises; given result folders, act greedily under their
+    optimized prompts in a world and in its official program, and compare."""
+    if not config.runs:
+        raise UsageError(
+            "no result folder given, and no world; usage: python -m experiments.check RUN_DIR ..., or "
+            "python -m experiments.check my_package.my_world:WORLD"
+        )
     if config.out:
         refuse_existing_file(config.out, "--out")
+    if worlds := named_worlds(config):
+        check(worlds, config.out)
+    else:
+        compare_runs(config)
+
+
+def named_worlds(config: CheckConfig) -> list[str]:
+    """The names and places among what was given; empty where all are result folders.
+
+    Raises:
+      UsageError: for a world that is not known, or a mixture.
+    """
+    names = [str(path) for path in config.runs if not os.path.lexists(path) and is_world(str(path))]
+    if names and len(names) < len(config.runs):
+        raise UsageError("give worlds to check, or result folders to compare, not both at once")
+    if names and (config.env or config.policy):
+        raise UsageError(
+            "--env and --policy are for result folders; leave them out to check a world"
+        )
+    for name in names:
+        envs.find(name)
+    return names
+
+
+def is_world(text: str) -> bool:
+    """Whether a word that is no folder names a world."""
+    return text in envs.names() or (":" in text and "/" not in text)
+
+
+def check(names: Sequence[str], out: Path | None) -> None:
+    """Check worlds one after the other.
+
+    Raises:
+      DataError: if one of them has a fault, after the reports.
+    """
+    from experiments.store.provenance import provenance
+    from mgpo_jax.files import write_json
+
+    reports = {}
+    for name in names:
+        reports[name] = envs.check_world(name)
+        say(str(reports[name]))
+    if out:
+        found = {name: dataclasses.asdict(report) for name, report in reports.items()}
+        write_json(out, {"worlds": found, **provenance()})
+    broken = [name for name, report in reports.items() if report.faults]
+    if broken:
+        raise DataError(f"{', '.join(broken)} must be mended before it is trained on")
+
+
+def compare_runs(config: CheckConfig) -> None:
+    """Compare the worlds of adaptations with their official programs."""
     from experiments.checking import HEAD, cells, compare, officials_of, summaries, told
     from experiments.evaluation import open_case
     from experiments.store.provenance import provenance

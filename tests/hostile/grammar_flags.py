@@ -133,7 +133,13 @@ CONTRADICTIONS: dict[str, tuple[tuple[str, str], ...]] = {
         ("nowhere", "nowhere"),
         ("policy", "policy"),
     ),
-    "check": (("--env gridworld", "gridworld"), ("nowhere", "nowhere"), ("policy", "policy")),
+    "check": (
+        ("--env gridworld", "gridworld"),
+        ("nowhere", "nowhere"),
+        ("policy", "policy"),
+        ("gridworld", "not both at once"),
+        ("nowhere:WORLD", "nowhere"),
+    ),
     "table": (("nowhere", "nowhere"), ("result nowhere", "nowhere"), ("policy", "policy")),
     "compare": (
         ("nowhere result", "nowhere"),
