@@ -66,8 +66,10 @@ class Report:
 class _Played(NamedTuple):
     """Episodes, numpy leaves ``[L, ..]`` or ``[L, T, ..]``."""
 
-    first: TimeStep
-    steps: TimeStep
+    first: Any
+    """A ``TimeStep``."""
+    steps: Any
+    """``TimeStep``s of every step."""
     unchanged: Any
     """Whether a step left the whole state as it was."""
 
@@ -108,7 +110,7 @@ def check_world(world: World | Environment | str, seed: int = 0) -> Report:
     Raises:
       UsageError: if there is no such world, or what it needs is not installed.
     """
-    record = envs.registry.find(world) if isinstance(world, str) else world
+    record: Any = envs.registry.find(world) if isinstance(world, str) else world
     notes: list[str] = []
     if isinstance(record, World):
         name = record.name
@@ -251,7 +253,8 @@ def _shape_faults(env: Environment) -> Iterator[str]:
             continue
         for part, (shape, dtype) in wanted.items():
             yield from _misfit(f"{part} of {name}", getattr(told, part), shape, dtype)
-    if jax.tree.structure(state) != jax.tree.structure(after):
+    old_fields: Any = jax.tree.structure(state)
+    if old_fields != jax.tree.structure(after):
         yield "the state of step has other fields than that of reset"
         return
     for (path, old), new in zip(
@@ -539,7 +542,8 @@ def _outcome_faults(case: _Case) -> Iterator[str]:
     apart = apart[apart > 0]
     near = 0.5 * np.median(apart) if apart.size else 1e-3
     best = np.asarray(jax.jit(jax.vmap(case.env.optimal_return))(case.tasks))
-    solved, missed = [], []
+    solved: list[tuple[int, int, bool]] = []
+    missed: list[tuple[int, int, bool]] = []
     for lane, end in enumerate(case.ends.tolist()):
         if end < 0 or not steps.terminated[lane, end] or steps.failed[lane, end]:
             continue

@@ -10,8 +10,10 @@ from typing import NoReturn
 
 import tyro
 
+import envs
 from envs.errors import UsageError, printable
 from experiments.runtime import Common, refuse_existing_file, run, say
+from mgpo_jax.settings import Name
 
 
 @dataclass(frozen=True)
@@ -20,6 +22,8 @@ class CompareConfig(Common):
 
     runs: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Result folders of two adaptations or more; each is compared with the first."""
+    env: Name | None = None
+    """Their world, for a world of your own (module:attribute)."""
     csv: Path | None = None
     """File to write the return of each task and run to, as comma-separated values."""
 
@@ -34,6 +38,8 @@ def main(config: CompareConfig) -> None:
         )
     if config.csv is not None:
         refuse_existing_file(config.csv, "--csv")
+    if config.env is not None:
+        envs.find(config.env)  # from now on results may name its place
     from experiments.pairing import as_csv, as_table, differing
     from experiments.store.results import load_results
 

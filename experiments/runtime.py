@@ -33,6 +33,9 @@ from experiments import signals
 from mgpo_jax.claims import NO_ROOM, check_place
 from mgpo_jax.settings import flag
 
+OF_CALLBACK = "INTERNAL: Error when calling buffer callback"
+"""How jax begins its message of an error in a function that a program called on the host."""
+
 EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
 
 # mallopt parameters of the GNU C library
@@ -238,6 +241,10 @@ def explained(error: BaseException, config: Any = None) -> str:
         if isinstance(cause, MemoryError) or "RESOURCE_EXHAUSTED" in str(cause):
             return "there is not enough memory; ask for less at once"
     text = str(error).splitlines()[0] if str(error) else "no reason is known"
+    if text.startswith(
+        OF_CALLBACK
+    ):  # then comes a traceback, which ends with the error on the host
+        return str(error).strip().splitlines()[-1].removeprefix("envs.errors.")
     platforms = os.environ.get("JAX_PLATFORMS")
     if platforms and "nable to initialize backend" in text:
         return f"JAX_PLATFORMS={platforms} names no device of this machine; unset it, or use cpu"

@@ -1,0 +1,259 @@
+"""Live environments of gymnasium on the host, found again by what has happened in them. No jax here.
+
+A program asks for a step of an episode by the episode's *identity*: a hash of how it began, of the actions
+since and of what came of them. Where a live environment stands exactly there, it is stepped. Where none
+does, since the program plays an episode again or takes another branch of it, a fresh one is reset in the
+same way and the actions are played again. An environment that then arrives elsewhere does not repeat
+itself, and is refused.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from threading import Lock
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from envs.errors import DataError
+
+
+class Moment(NamedTuple):
+    """What a gymnasium environment tells after a reset or a step, for the functions that read it."""
+
+    obs: Any
+    info: Mapping[str, Any]
+    env: Any
+    """The environment itself, to look at what its observations leave out."""
+    reward: float = 0.0
+    """Sum over the repeated steps; 0 after a reset."""
+    terminated: bool = False
+    truncated: bool = False
+
+
+class Reading(NamedTuple):
+    """A moment as arrays, in the order and the dtypes in which programs hold them."""
+
+    obs: np.ndarray
+    achieved_goal: np.ndarray
+    outcome: np.ndarray
+    reward: np.ndarray
+    flags: np.ndarray
+    """``goal_reached``, ``terminated``, ``truncated`` and ``failed``, uint8 ``[4]``."""
+
+    @property
+    def over(self) -> bool:
+        return bool(self.flags[1:].any())
+
+
+class Start(NamedTuple):
+    """How an episode begins: all that its reset depends on."""
+
+    seed: int
+    options: tuple[np.ndarray, ...]
+    """The leaves of the options, in their order."""
+
+
+Act = Callable[[Moment], Any]
+"""The next action of a script in units of the environment, or None to end the episode."""
+
+
+@dataclass
+class Live:
+    """One environment and where it stands."""
+
+    env: Any
+    identity: bytes = b""
+    steps: int = 0
+    moment: Any = None
+    script: tuple[str, int] | None = None
+    """Name and seed of the script that follows this episode."""
+    act: Act | None = None
+    asked: tuple[bytes, Any] | None = None
+    """The identity at which the script was asked last, and its action."""
+
+
+@dataclass(eq=False)
+class Pool:
+    """Live environments that were made by one recipe; callers may be on several threads.
+
+    Attributes:
+      make: a new environment.
+      reset: ``(env, start) -> moment``.
+      step: ``(env, action) -> moment``; the action is that of a program.
+      read: ``(moment) -> reading``.
+      scripts: ``(env, generator) -> act`` by name.
+      most: how many environments are kept alive; the one that was longest not used makes room.
+      num_threads: how many threads step them.
+    """
+
+    make: Callable[[], Any]
+    reset: Callable[[Any, Start], Moment]
+    step: Callable[[Any, np.ndarray], Moment]
+    read: Callable[[Moment], Reading]
+    scripts: Mapping[str, Callable[[Any, np.random.Generator], Act]] = field(default_factory=dict)
+    most: int = 256
+    num_threads: int = 1
+
+    def __post_init__(self) -> None:
+        self._lock = Lock()
+        self._live: OrderedDict[bytes, Live] = OrderedDict()
+        self._idle: list[Any] = []
+        self._memory: OrderedDict[bytes, tuple[bytes, Reading]] = OrderedDict()
+        self._threads = ThreadPoolExecutor(self.num_threads) if self.num_threads > 1 else None
+        self.num_made = self.num_replayed = 0
+
+    def begin(self, start: Start) -> tuple[bytes, Moment, Reading]:
+        """A new episode: its identity, its first moment and the reading of that."""
+        live, reading = self._fresh(start)
+        found = live.identity, live.moment, reading
+        self._put(live)
+        return found
+
+    def advance(
+        self, start: Start, identity: bytes, actions: np.ndarray, action: np.ndarray
+    ) -> tuple[bytes, Reading]:
+        """The identity after one more action, and the reading.
+
+        Args:
+          start: how the episode began.
+          identity: where it stands.
+          actions: those taken so far, ``[t, ..]``.
+          action: the next one.
+
+        Raises:
+          DataError: if the environment does not repeat itself.
+        """
+        wanted = identity + action.tobytes()
+        live = self._take(identity)
+        if live is None:
+            with self._lock:
+                known = self._memory.get(wanted)
+            if known is not None:
+                return known
+            live = self._replay(start, identity, actions)
+        reading = self._step(live, action)
+        found = live.identity, reading
+        with self._lock:
+            self._memory[wanted] = found
+            while len(self._memory) > 2 * self.most:
+                self._memory.popitem(last=False)
+        if reading.over:
+            self._release(live.env)
+        else:
+            self._put(live)
+        return found
+
+    def ask(self, start: Start, identity: bytes, actions: np.ndarray, name: str, seed: int) -> Any:
+        """What a script does next in an episode, in units of the environment; None ends the episode."""
+        script = (name, seed)
+        live = self._take(identity)
+        follows = live is not None and (live.script == script or live.steps == 0)
+        if live is None or not follows:
+            if live is not None:
+                self._put(live)
+            live = self._replay(start, identity, actions, script)
+        if live.script != script:
+            self._attach(live, script)
+        if live.asked is None or live.asked[0] != identity:
+            assert live.act is not None
+            live.asked = (identity, live.act(live.moment))
+        action = live.asked[1]
+        self._put(live)
+        return action
+
+    def map(self, function: Callable[[int], Any], num: int) -> list[Any]:
+        """``function(0)``, ``function(1)``, .. on the threads of the pool."""
+        if self._threads is None or num < 2:
+            return [function(index) for index in range(num)]
+        return list(self._threads.map(function, range(num)))
+
+    def _fresh(self, start: Start) -> tuple[Live, Reading]:
+        env = self._free_env()
+        try:
+            moment = self.reset(env, start)
+            reading = self.read(moment)
+        except BaseException:
+            self._release(env)
+            raise
+        first = [np.int64(start.seed).tobytes(), *(leaf.tobytes() for leaf in start.options)]
+        return Live(env, _hash(b"".join(first), reading), moment=moment), reading
+
+    def _step(self, live: Live, action: np.ndarray) -> Reading:
+        live.moment = self.step(live.env, action)
+        reading = self.read(live.moment)
+        live.identity = _hash(live.identity + action.tobytes(), reading)
+        live.steps += 1
+        return reading
+
+    def _attach(self, live: Live, script: tuple[str, int]) -> None:
+        live.script, live.asked = script, None
+        live.act = self.scripts[script[0]](live.env, np.random.default_rng(script[1]))
+
+    def _replay(
+        self,
+        start: Start,
+        identity: bytes,
+        actions: np.ndarray,
+        script: tuple[str, int] | None = None,
+    ) -> Live:
+        """A live environment that has been brought to where an episode stands."""
+        self.num_replayed += 1
+        live, _ = self._fresh(start)
+        if script is not None:
+            self._attach(live, script)
+        for action in actions:
+            if live.act is not None:
+                live.asked = (live.identity, live.act(live.moment))
+            self._step(live, np.asarray(action))
+        if live.identity != identity:
+            self._release(live.env)
+            raise DataError(
+                f"the gymnasium environment does not repeat itself: reset with seed {start.seed} and "
+                f"{len(actions)} actions once more, it tells something else than before; all of its chance "
+                "must come from the seed of reset, and reset must forget all earlier episodes"
+            )
+        return live
+
+    def _take(self, identity: bytes) -> Live | None:
+        with self._lock:
+            return self._live.pop(identity, None)
+
+    def _put(self, live: Live) -> None:
+        with self._lock:
+            other = self._live.pop(live.identity, None)  # an equal one
+            self._live[live.identity] = live
+            if other is not None:
+                self._idle.append(other.env)
+
+    def _release(self, env: Any) -> None:
+        with self._lock:
+            self._idle.append(env)
+
+    def _free_env(self) -> Any:
+        """An idle environment, a new one, or that of the episode that was longest not used."""
+        with self._lock:
+            if self._idle:
+                return self._idle.pop()
+            if self.num_made >= self.most and self._live:
+                return self._live.popitem(last=False)[1].env
+            self.num_made += 1
+        return self.make()
+
+
+def num_cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _hash(before: bytes, reading: Reading) -> bytes:
+    """8 bytes for what has happened; two episodes agree by chance once in 2^64."""
+    digest = hashlib.blake2b(before, digest_size=8)
+    for part in reading:
+        digest.update(part.tobytes())
+    return digest.digest()

@@ -1,0 +1,149 @@
+"""The worlds as gymnasium environments: ``gymnasium.make("mgpo_jax/maze15-v0")``.
+
+They are registered when this module is imported, which gymnasium's ``gymnasium.register_envs`` is for:
+
+    import gymnasium, envs.to_gymnasium
+    gymnasium.register_envs(envs.to_gymnasium)
+
+An observation is a dict of ``observation``, ``achieved_goal`` and ``desired_goal``, as gymnasium-robotics'
+``GoalEnv`` has it; the desired goal is that of the task, which does not tell everything. There is no
+``compute_reward``: what a world pays depends on more than two goals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
+
+import envs.registry
+from envs.base import ArraySpec, Environment, Task, TimeStep
+from envs.errors import UsageError
+from envs.registry import World
+
+NAMESPACE, VERSION = "mgpo_jax", 0
+KEYS = 2**32
+
+
+class WorldEnv(gymnasium.Env):
+    """A world of this project, stepped by hand.
+
+    ``reset(seed=..)`` draws a task, and the chance of its episode. ``reset(options={"task": task})`` has
+    the episode on a task of yours; ``options={"same_task": True}`` on the last one. ``info`` tells
+    ``goal_reached``, whether the achieved goal counts, ``outcome``, the goal that this episode would have
+    in hindsight, and ``failed``, whether the world broke down.
+
+    Args:
+      world: its name or place, its record, or an environment of it.
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012 (the form that gymnasium asks for)
+
+    def __init__(self, world: str | World | Environment) -> None:
+        if isinstance(world, Environment):
+            self.world = world
+        else:
+            self.world = envs.registry.make(world) if isinstance(world, str) else world.make()
+        spec = self.world.spec
+        goals = spaces.Box(-np.inf, np.inf, (spec.goal_dim,), np.float32)
+        self.observation_space = spaces.Dict(
+            observation=_box(spec.obs), achieved_goal=goals, desired_goal=goals
+        )
+        self.action_space = (
+            spaces.Discrete(spec.action_dim)
+            if spec.discrete
+            else spaces.Box(-1.0, 1.0, (spec.action_dim,), np.float32)
+        )
+        self._programs = _programs(self.world)
+        self.task: Task | None = None
+        """The task of the current episode."""
+
+    def reset(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        super().reset(seed=seed)
+        key_task, key = jax.random.split(jax.random.key(int(self.np_random.integers(KEYS))))
+        draw, goal_of, reset, _ = self._programs
+        self.task = self._chosen(options or {})
+        if self.task is None:
+            self.task = draw(key_task)
+        self._goal = np.asarray(goal_of(self.task), np.float32)
+        self._state, told = reset(key, self.task)
+        return self._observed(told), _info(told)
+
+    def step(self, action: Any) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        zero = self.world.spec.zero_action()
+        self._state, told = self._programs[3](self._state, jnp.asarray(action, zero.dtype))
+        flags = bool(told.terminated), bool(told.truncated)
+        return self._observed(told), float(told.reward), *flags, _info(told)
+
+    def _chosen(self, options: Mapping[str, Any]) -> Task | None:
+        """The task that options of a reset ask for; None draws one."""
+        if unknown := set(options) - {"task", "same_task"}:
+            raise UsageError(
+                f"options of reset are task and same_task, found {', '.join(sorted(unknown))}"
+            )
+        if options.get("same_task"):
+            if self.task is None:
+                raise UsageError("there is no last task yet; call reset without same_task first")
+            return self.task
+        if "task" not in options:
+            return None
+        task = options["task"]
+        self.world.check_task(jax.tree.map(lambda leaf: np.asarray(leaf)[None], task))
+        return jax.tree.map(jnp.asarray, task)
+
+    def _observed(self, told: TimeStep) -> dict[str, np.ndarray]:
+        return {
+            "observation": np.array(told.obs),
+            "achieved_goal": np.array(told.achieved_goal),
+            "desired_goal": self._goal.copy(),
+        }
+
+
+def _box(obs: ArraySpec) -> spaces.Box:
+    """All observations of a shape and dtype."""
+    dtype: Any = np.dtype(obs.dtype)
+    if obs.is_float:
+        return spaces.Box(-np.inf, np.inf, obs.shape, dtype)
+    return spaces.Box(np.iinfo(dtype).min, np.iinfo(dtype).max, obs.shape, dtype)
+
+
+def _info(told: TimeStep) -> dict[str, Any]:
+    return {
+        "goal_reached": bool(told.goal_reached),
+        "outcome": np.array(told.outcome),
+        "failed": bool(told.failed),
+    }
+
+
+@cache
+def _programs(env: Environment) -> tuple[Any, Any, Any, Any]:
+    """Drawing a task, its goal, reset and step, compiled once for equal worlds."""
+    compiled = jax.jit(compiler_options=dict(env.engine.compiler_options))
+    return (
+        compiled(env.sample_task),
+        compiled(env.task_goal),
+        compiled(env.reset),
+        compiled(env.step),
+    )
+
+
+def register(*names: str) -> None:
+    """Make worlds known to gymnasium as ``mgpo_jax/NAME-v0``; a place is known by its world's name."""
+    for name in names:
+        own = envs.registry.find(name).name
+        identity = f"{NAMESPACE}/{own}-v{VERSION}"
+        if identity not in gymnasium.registry:
+            gymnasium.register(
+                identity, entry_point="envs.to_gymnasium:WorldEnv", kwargs={"world": name}
+            )
+
+
+register(*(world.name for world in envs.registry.WORLDS.usable()))
