@@ -158,8 +158,7 @@ class GymnasiumWorld:
         """
         from envs.base import ArraySpec
 
-        env = self.make()
-        options = self.drawn_options(0)
+        env, options = self._example, self.drawn_options(0)
         moment = self.reset(env, Start(0, tuple(options[name] for name in sorted(options))))
         obs, goal = self._observed(moment), self._goal(moment, "achieved")
         for what, found in (
@@ -185,7 +184,12 @@ class GymnasiumWorld:
     @cached_property
     def action_space(self) -> Any:
         """Of the environment."""
-        return self.make().action_space
+        return self._example.action_space
+
+    @cached_property
+    def _example(self) -> Any:
+        """An environment to look at, which no episode is played in."""
+        return self.make()
 
     def _horizon(self, env: Any) -> int:
         limit = self.horizon
@@ -267,7 +271,8 @@ class GymnasiumWorld:
         finite = all(np.isfinite(part).all() for part in (obs, goal, outcome, reward))
         flags = (self.reached(moment), moment.terminated, moment.truncated, not finite)
         told = Reading(obs, goal, outcome, reward, np.asarray(flags, np.uint8))
-        return told if finite else Reading(*map(np.nan_to_num, told))
+        # Copies, since an environment may go on writing into the arrays that it has told.
+        return Reading(*map(np.array if finite else np.nan_to_num, told))
 
     def goal_of(self, moment: Moment) -> np.ndarray:
         """The goal of a task, of the moment after its reset."""

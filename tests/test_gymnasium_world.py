@@ -8,6 +8,7 @@ import shutil
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import gymnasium
@@ -34,10 +35,11 @@ def fresh(described: GymnasiumWorld, **changes) -> GymnasiumWorld:
     return replace(described, **changes)
 
 
+SWITCHED = pytest.param(SWITCHING, marks=pytest.mark.slow)
 WINDS = pytest.param(WINDY.world(num_test_tasks=4), marks=pytest.mark.slow)
 
 
-@pytest.mark.parametrize("world", [WORLD, SWITCHING, WINDS], ids=["plane", "switches", "windy"])
+@pytest.mark.parametrize("world", [WORLD, SWITCHED, WINDS], ids=["plane", "switches", "windy"])
 def test_they_keep_what_every_world_promises(world) -> None:
     report = envs.check_world(world)
     assert report.faults == ()
@@ -113,6 +115,41 @@ def test_few_live_environments_and_threads_change_nothing() -> None:
     assert (found[0].return_ == 1).all()
     assert described.pool.num_replayed > 0
     assert described.pool.num_made <= 5
+
+
+def test_accelerators_call_the_host_in_another_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    described = fresh(PLANE)
+    env, keys = described.environment(), jax.random.split(jax.random.key(0), 3)
+
+    def begin_and_step(key):
+        state, _ = env.reset(key, env.sample_task(key))
+        return env.step(state, jnp.float32([0.1, -1.0]))[1]
+
+    told = []
+    for backend in ("cpu", "gpu"):
+        monkeypatch.setattr(jax, "default_backend", lambda backend=backend: backend)
+        told.append(jax.jit(jax.vmap(partial(begin_and_step)))(keys))
+    jax.tree.map(np.testing.assert_array_equal, *told)
+
+
+class InPlace(Plane):
+    """Writes what it tells into one array of float32."""
+
+    def look(self):
+        seen = super().look()
+        if not hasattr(self, "kept"):
+            self.kept = np.zeros(4, np.float32)
+        self.kept[:] = seen["observation"]
+        return {**seen, "observation": self.kept}
+
+
+def test_what_was_told_stays_as_it_was() -> None:
+    described, start = fresh(PLANE, make=InPlace), Start(3, ())
+    first, _, reading = described.pool.begin(start)
+    kept = reading.obs.copy()
+    moves = np.full((1, 2), 0.5, np.float32)
+    described.pool.advance(start, first, moves[:0], moves[0])
+    np.testing.assert_array_equal(reading.obs, kept)
 
 
 class Forgetful(Plane):
