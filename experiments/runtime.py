@@ -241,9 +241,8 @@ def explained(error: BaseException, config: Any = None) -> str:
         if isinstance(cause, MemoryError) or "RESOURCE_EXHAUSTED" in str(cause):
             return "there is not enough memory; ask for less at once"
     text = str(error).splitlines()[0] if str(error) else "no reason is known"
-    if text.startswith(
-        OF_CALLBACK
-    ):  # then comes a traceback, which ends with the error on the host
+    if text.startswith(OF_CALLBACK):
+        # Then comes a traceback, which ends with the error on the host.
         return str(error).strip().splitlines()[-1].removeprefix("envs.errors.")
     platforms = os.environ.get("JAX_PLATFORMS")
     if platforms and "nable to initialize backend" in text:

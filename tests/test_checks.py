@@ -257,10 +257,15 @@ def test_faults_are_found(fault: str) -> None:
         assert "\n" not in text
 
 
-SOUND = [record(Track()), WORLD, Track(), pytest.param("gridworld", marks=pytest.mark.slow)]
+SOUND = [
+    record(Track()),
+    Track(),
+    pytest.param(WORLD, marks=pytest.mark.slow),
+    pytest.param("gridworld", marks=pytest.mark.slow),
+]
 
 
-@pytest.mark.parametrize("world", SOUND, ids=["track", "line", "spec", "gridworld"])
+@pytest.mark.parametrize("world", SOUND, ids=["track", "spec", "line", "gridworld"])
 def test_sound_worlds_have_no_fault(world: Any) -> None:
     report = envs.check_world(world)
     assert (report.faults, report.notes) == ((), ())

@@ -299,12 +299,16 @@ def save_untrained(folder: Path) -> None:
     mgpo_jax.save_policy(folder, config, params, {"env": "own_gymnasium:WORLD"})
 
 
-def test_commands_take_them(folder: Path) -> None:
+def test_a_script_demonstrates(folder: Path) -> None:
     command(COLLECT.replace("--trajectories 40", "--trajectories 12"))
     with np.load("data/plane/straight-12-seed0/trajectories.npz") as file:
         assert file["lengths"].max() <= 12
         assert file["obs"].shape[1:] == (4,)
         assert file["rewards"].sum() == 12
+
+
+@pytest.mark.slow
+def test_an_untrained_policy_adapts(folder: Path) -> None:
     save_untrained(Path("untrained"))
     command(f"{ADAPT} untrained --out untrained-ucb")
     summary = json.loads(Path("untrained-ucb/summary.json").read_text())

@@ -1,0 +1,1 @@
+"""Worlds made of environments that others wrote; docs/guides/own-gymnasium-world.md walks through them."""

@@ -1,0 +1,75 @@
+"""The worlds in ``examples/`` are sound, and the guide shows one of them as it is."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import envs
+from envs.episodes import run_episode
+from envs.registry import World
+
+ROOT = Path(__file__).parents[1]
+GUIDE = ROOT / "docs" / "guides" / "own-gymnasium-world.md"
+
+
+@pytest.fixture(autouse=True)
+def _root(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "path", [*sys.path, str(ROOT)])
+
+
+def world(name: str) -> World:
+    if name == "doors":
+        pytest.importorskip("minigrid")
+    return importlib.import_module(f"examples.{name}").WORLD
+
+
+def test_the_guide_shows_the_example() -> None:
+    source = (ROOT / "examples" / "doors.py").read_text()
+    assert f"```python\n{source}```" in GUIDE.read_text()
+    assert len(source.splitlines()) < 150
+    assert f"{len(source.splitlines())} lines" in GUIDE.read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["doors", "point_maze"])
+def test_they_are_sound(name: str) -> None:
+    assert envs.check_world(world(name)).faults == ()
+
+
+def test_the_planner_reaches_the_goal_through_the_doors() -> None:
+    doors = world("doors")
+    env, key = doors.make(), jax.random.key(0)
+    planner = doors.demonstrators(env)["planner"]
+    task = planner.sample_task(key, jnp.int32(0))
+    episode = jax.jit(lambda key, task: run_episode(key, env, planner.agent(()), task))(key, task)
+    length = int(episode.trajectory.length)
+    assert 20 <= length < 60
+    np.testing.assert_allclose(episode.trajectory.outcomes[length - 1], task.goal)
+    # Minigrid pays 1 - 0.9 steps / 80 at the goal.
+    assert episode.return_ == pytest.approx(1 - 0.9 * length / 80, abs=1e-5)
+    assert episode.trajectory.obs[:length, 3].any()  # a closed door was ahead
+
+
+@pytest.mark.slow
+def test_the_kitchen_pays_in_turn() -> None:
+    kitchen = world("kitchen").make()
+    described = kitchen.described
+    wrapper = described.make()
+    wrapper.reset(seed=0, options={"order": [4, 1, 0, -1, -1]})
+    assert wrapper.order == ["microwave", "light switch", "bottom burner"]
+    assert kitchen.spec.obs == envs.make("kitchen").spec.obs
+    assert kitchen.spec.actions == envs.make("kitchen").spec.actions
+    task = kitchen.sample_task(jax.random.key(0))
+    state, told = kitchen.reset(jax.random.key(0), task)
+    assert told.obs.shape == (59,)
+    assert task.goal.sum() == 3
+    _, told = kitchen.step(state, jnp.zeros(9))
+    assert not told.goal_reached
+    assert told.reward == 0
