@@ -253,7 +253,8 @@ def check_same(config: PretrainConfig, meta: dict[str, Any]) -> None:
         if (place := saved.get("dataset")) != meta["dataset"]:
             raise DataError(
                 f"{folder} was trained on {shown(place)} with the hash {shown(hash_before)[:13]}.., "
-                f"{meta['dataset']} has {hash_now[:12]}..; give the same data, or start a new run with --out"
+                f"{meta['dataset']} has {hash_now[:12]}..; give the same data, or start a new run with "
+                "--out"
             )
         raise DataError(
             f"{folder} was trained on {meta['dataset']} with the hash {shown(hash_before)[:13]}.., which "
