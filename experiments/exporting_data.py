@@ -91,26 +91,30 @@ def flat_arrays(dataset: Dataset, facts: Facts) -> dict[str, np.ndarray]:
     }
 
 
+def _spaces(facts: Facts) -> tuple[Any, Any]:
+    """The spaces of observations and of actions, as gymnasium has them."""
+    import gymnasium
+
+    spaces: Any = gymnasium.spaces
+    dtype = np.dtype(facts.obs_dtype)
+    if dtype.kind == "b":
+        seen = spaces.MultiBinary(facts.obs_shape)
+    else:
+        whole = dtype.kind in "iu"
+        low, high = (np.iinfo(dtype).min, np.iinfo(dtype).max) if whole else (-np.inf, np.inf)
+        seen = spaces.Box(low, high, facts.obs_shape, dtype.type)
+    if facts.num_actions is not None:
+        return seen, spaces.Discrete(facts.num_actions)
+    return seen, spaces.Box(-1, 1, (facts.action_dim,), np.float32)
+
+
 def _write_minari(dataset: Dataset, facts: Facts, out: Path, author: str) -> None:
     """A Minari dataset in a folder, written a trajectory at a time."""
     minari = import_extra("minari", "minari")
-    import gymnasium
     from minari.data_collector import EpisodeBuffer
     from minari.dataset.minari_storage import MinariStorage
 
-    dtype = np.dtype(facts.obs_dtype)
-    whole = dtype.kind in "iu"
-    low, high = (np.iinfo(dtype).min, np.iinfo(dtype).max) if whole else (-np.inf, np.inf)
-    spaces: Any = gymnasium.spaces
-    seen = (
-        spaces.MultiBinary(facts.obs_shape)
-        if dtype.kind == "b"
-        else spaces.Box(low, high, facts.obs_shape, dtype.type)
-    )
-    num = facts.num_actions
-    acted = (
-        spaces.Box(-1, 1, (facts.action_dim,), np.float32) if num is None else spaces.Discrete(num)
-    )
+    seen, acted = _spaces(facts)
 
     def episodes() -> Iterator[Any]:
         terminated, truncated = _ends(dataset)
