@@ -9,19 +9,23 @@ from typing import Any
 
 import jax
 
+import envs
 from envs.base import Environment, Task
 from envs.registry import World
 from experiments.inventory import price_of, seconds_per_episode
 from experiments.store.settings import AdaptConfig, PretrainConfig
 from experiments.store.summary import judged_episodes
 from experiments.store.tables import block
+from experiments.training import sized_network
 from mgpo_jax import methods
+from mgpo_jax.dataset import spec_of
 from mgpo_jax.files import to_json
+from mgpo_jax.kinds import MULTI_GOAL
+from mgpo_jax.manifest import read_facts
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.runner import log_bytes
 from mgpo_jax.tasks import num_tasks
 from mgpo_jax.training import initial_params
-from mgpo_jax.transformer import TransformerConfig
 
 OPTIMIZER = 3  # weights, their gradient and a moment, at least, in a gradient step
 
@@ -58,22 +62,20 @@ def _num_variants(config: AdaptConfig) -> int:
     return len(variants(config))
 
 
-def of_training(config: PretrainConfig, network: Any, env_steps: int) -> str:
+def of_training(config: PretrainConfig) -> str:
     """What ``pretrain`` would do: the network, its batches, memory and CPU time.
 
-    Args:
-      config: the settings.
-      network: the config of the network; only that of the multi-goal Transformer has its weights counted.
-      env_steps: T, the longest trajectory.
-
-    The CPU time is that of the released policy of this world (``inventory.price_of``).
+    The weights of the multi-goal Transformer are counted; those of other kinds follow from their data. The
+    CPU time is that of the released policy of this world (``inventory.price_of``).
     """
-    train = config.train
+    train, folder = config.train, config.data.data_folder
+    spec = spec_of(read_facts(folder)) if folder is not None else envs.make(config.env).spec
     rows = [("trajectories", f"{config.data.trajectories:,}, {config.holdout:,} of them held out")]
-    if isinstance(network, TransformerConfig):
+    if config.method == MULTI_GOAL:
+        network = sized_network(config, spec)
         shapes = jax.eval_shape(lambda key: initial_params(key, network), jax.random.key(0))
         num = _num_weights(shapes)
-        tokens = network.max_prompt_length + network.num_step_tokens(env_steps)
+        tokens = network.max_prompt_length + network.num_step_tokens(spec.horizon)
         rows += [
             ("network", f"{num:,} weights"),
             ("tokens", f"at most {tokens:,} a trajectory"),
@@ -82,7 +84,7 @@ def of_training(config: PretrainConfig, network: Any, env_steps: int) -> str:
     rows += [
         ("batches", f"{train.batch_size} trajectories in parts of {train.part_size}"),
         ("steps", f"{train.steps:,}"),
-        ("CPU time", _told(price_of(config))),
+        ("CPU time", _told(None if folder is not None else price_of(config))),
         ("run", str(config.folder)),
     ]
     return block(f"{config.env}, {config.method}: nothing is done yet", rows)

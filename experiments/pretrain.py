@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-from experiments.runtime import run
+from experiments.runtime import run, say
 from experiments.store.runs import check_start
 from experiments.store.settings import PretrainConfig, check_pretraining, pretrain_default
 from mgpo_jax.manifest import read_facts
@@ -15,11 +15,17 @@ from mgpo_jax.manifest import read_facts
 def main(config: PretrainConfig) -> None:
     """Pre-train the multi-goal Transformer on hindsight prompts."""
     check_pretraining(config)
-    check_start(config)
+    if not config.dry_run:
+        check_start(config)
     if config.data.data_folder is not None:
         from experiments.store.recipes import told
 
         print(told(config, read_facts(config.data.data_folder)), file=sys.stderr)
+    if config.dry_run:
+        from experiments.forecasts import of_training
+
+        say(of_training(config))
+        return
     from experiments.training import train
 
     train(config)

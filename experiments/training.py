@@ -98,18 +98,23 @@ def configured_network(
     """
     if init is not None:
         return replace(init.config, dropout=config.dropout)
-    learned = KINDS.find(config.method).load()
-    common = {f.name for f in fields(learned.config)} & {f.name for f in fields(PretrainConfig)}
-    sizes = {name: getattr(config, name) for name in common}
     spec = env.spec if env is not None else spec
     assert spec is not None
-    sizes |= world_side(spec, config.head, config.encoder)
-    network = learned.complete(learned.config(**sizes), env, dataset)
+    learned = KINDS.find(config.method).load()
+    network = learned.complete(sized_network(config, spec), env, dataset)
     if not config.standardize_obs:
         return network
     mean, std = moments(dataset.obs)
     std = np.where(std < CONSTANT, 1.0, std)
     return replace(network, obs_mean=tuple(mean.tolist()), obs_std=tuple(std.tolist()))
+
+
+def sized_network(config: PretrainConfig, spec: EnvSpec) -> Any:
+    """The network of the settings, without what follows from the data."""
+    learned = KINDS.find(config.method).load()
+    common = {f.name for f in fields(learned.config)} & {f.name for f in fields(PretrainConfig)}
+    sizes = {name: getattr(config, name) for name in common}
+    return learned.config(**{**sizes, **world_side(spec, config.head, config.encoder)})
 
 
 def moments(obs: np.ndarray, piece: int = 1 << 24) -> tuple[np.ndarray, np.ndarray]:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from experiments import adapt
+from experiments import adapt, pretrain
 from experiments.parsing import parse
-from experiments.store.settings import AdaptConfig
+from experiments.store.settings import AdaptConfig, PretrainConfig, pretrain_default
 
 ROOT = Path(__file__).parents[1]
 
@@ -34,4 +34,17 @@ def test_what_was_never_measured_is_not_known(
     monkeypatch.chdir(tmp_path)
     adapt.main(parse(AdaptConfig, ["--dry-run"], adapt.adapt_default))
     assert "not known" in capsys.readouterr().out
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_training_is_only_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    pretrain.main(parse(PretrainConfig, ["--steps", "4000", "--dry-run"], pretrain_default))
+    found = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()[2:])
+    assert found["trajectories"] == "100,000, 200 of them held out"
+    assert found["network"] == "606,853 weights"  # as the released policy has
+    assert found["tokens"] == f"at most {5 + 2 * 64 - 1:,} a trajectory"
+    assert found["CPU"].startswith("time some ")
     assert not list(tmp_path.iterdir())
