@@ -24,7 +24,8 @@ def test_an_adaptation_is_only_counted(
     assert found["episodes"] == "8,000 of the searches, 1,000 that judge"  # after 1, 10, .., 40
     assert found["steps"] == f"at most {9_000 * 64:,}"
     assert found["network"] == "606,853 weights"
-    assert found["CPU"].startswith("time some ")
+    assert "time" in found["CPU"]
+    assert "some " in found["CPU"]
     assert not (tmp_path / "new").exists()
 
 
@@ -46,5 +47,6 @@ def test_a_training_is_only_counted(
     assert found["trajectories"] == "100,000, 200 of them held out"
     assert found["network"] == "606,853 weights"  # as the released policy has
     assert found["tokens"] == f"at most {5 + 2 * 64 - 1:,} a trajectory"
-    assert found["CPU"].startswith("time some ")
+    assert "time" in found["CPU"]
+    assert "some " in found["CPU"]
     assert not list(tmp_path.iterdir())
