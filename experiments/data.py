@@ -94,6 +94,8 @@ def command(argv: Sequence[str] | None = None) -> NoReturn:
     words = list(sys.argv[1:] if argv is None else argv)
     if words and words[0] in SUBCOMMANDS:
         run(SUBCOMMANDS[words[0]], RUNS[words[0]], argv=words[1:])
+    if words and not words[0].startswith("-"):  # no flag of a command can be right then
+        words = words[:1]
     run(DataCommandConfig, main, argv=words)
 
 

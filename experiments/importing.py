@@ -109,17 +109,20 @@ class Writer:
         finish_mapped(self.place, names, len(lengths), int(lengths.sum()), manifest)
 
 
-def named(name: str, arrays: Mapping[str, np.ndarray], who: str) -> np.ndarray:
-    """The array of a name, or the only one whose name ends with it after a slash."""
+def named(name: str, arrays: Mapping[str, np.ndarray], who: str, flag: str) -> np.ndarray:
+    """The array of a name, or the only one whose name ends with it after a slash.
+
+    Raises:
+      UsageError: if there is none, or several; ``flag`` named it.
+    """
     if name in arrays:
         return arrays[name]
     found = [key for key in arrays if key.endswith(f"/{name}")]
     if len(found) == 1:
         return arrays[found[0]]
     what = "several arrays" if found else "no array"
-    raise DataError(
-        f"{who} has {what} named {shown(name)}; it has {printable(', '.join(sorted(found or arrays)))}"
-    )
+    known = printable(", ".join(sorted(found or arrays)))
+    raise UsageError(f"{who} has {what} named {shown(name)}; give {flag} one of {known}")
 
 
 def load_function(place: str) -> Callable[..., Any]:
@@ -150,7 +153,7 @@ def _wants_episode(function: Callable[..., Any]) -> bool:
 def observations(config: ImportConfig, arrays: Mapping[str, np.ndarray], who: str) -> np.ndarray:
     """The observations of an episode, [T + 1, ...] or [T, ...], in a dtype that a network takes."""
     if config.obs_arrays:
-        parts = [named(name, arrays, who) for name in config.obs_arrays]
+        parts = [named(name, arrays, who, "--obs-arrays") for name in config.obs_arrays]
     else:
         found = first_of(OBSERVATIONS, arrays)
         if found is None:
@@ -320,12 +323,12 @@ class Converter:
             if (most := max(config.goal_columns)) >= flat.shape[1]:
                 raise UsageError(
                     f"--goal-columns {most} is none of the {flat.shape[1]} components of an "
-                    f"observation, which "
-                    "are counted from 0"
+                    "observation, which are counted from 0; choose another"
                 )
             found, what = flat[:, list(config.goal_columns)], "--goal-columns"
         elif config.goal_array:
-            found, what = named(config.goal_array, arrays, who), f"--goal-array {config.goal_array}"
+            what = f"--goal-array {config.goal_array}"
+            found = named(config.goal_array, arrays, who, "--goal-array")
         else:
             assert self.function is not None
             what = f"--goal {config.goal}"

@@ -399,5 +399,5 @@ def _size(folder: Path, dataset: Dataset) -> str:
         if isinstance(a, np.memmap) and n in (*STEP_ARRAYS, "rewards")
     }
     in_memory = sum(a.nbytes for a in arrays.values())
-    text = f"{on_disk / 1e6:,.1f} MB on disk, {in_memory / 1e6:,.1f} MB as arrays"
+    text = f"{on_disk / 1e6:,.2f} MB on disk, {in_memory / 1e6:,.2f} MB as arrays"
     return f"{text}, which are mapped and not read" if mapped else f"{text}, which are in memory"

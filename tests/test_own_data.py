@@ -348,7 +348,10 @@ def test_bad_episodes_can_be_left_out():
     [
         ({}, "nothing says what a goal is; give --goal-columns with some of the 3 components"),
         ({"goal_columns": (3,)}, "--goal-columns 3 is none of the 3 components"),
-        ({"goal_array": "goals"}, "episode 0 has no array named 'goals'; it has actions, "),
+        (
+            {"goal_array": "goals"},
+            "episode 0 has no array named 'goals'; give --goal-array one of actions, ",
+        ),
         ({"goal_columns": (0,), "obs_arrays": ("state",)}, "episode 0 has no array named 'state'"),
         ({"goal_columns": (0,), "goal_array": "x"}, "--goal-columns and --goal-array both say"),
         ({"goal_columns": (0, 0)}, "names a component twice"),

@@ -9,10 +9,10 @@ from typing import Annotated, Any, Literal
 import tyro
 from annotated_types import Ge, Le
 
-from envs.errors import UsageError
+from envs.errors import UsageError, shown
 from experiments.runtime import Common
 from mgpo_jax.schema import Name as WorldName
-from mgpo_jax.settings import Count, Index, Name
+from mgpo_jax.settings import Count, Index, Name, setting_fault
 
 Number = Annotated[float, Ge(-1e18), Le(1e18)]
 
@@ -59,7 +59,7 @@ class ImportConfig(Common):
     """Whether a trajectory that is cut at any step shows how to reach another goal."""
     skip_bad: bool = False
     """Leave episodes out that hold NaN or infinity, or are longer than the horizon."""
-    name: WorldName | None = None
+    name: Name | None = None
     """What messages call the world that the logs are from (default: the name of the source)."""
 
 
@@ -118,24 +118,37 @@ def check_import(config: ImportConfig) -> None:
         "--goal-columns": config.goal_columns,
         "--goal-array": config.goal_array,
     }
-    if len(given := [flag for flag, value in ways.items() if value]) > 1:
+    given = [f"{flag} {_shown(value)}" for flag, value in ways.items() if value]
+    if len(given) > 1:
         raise UsageError(
             f"{given[0]} and {given[1]} both say what a goal is; leave one of them out"
         )
+    if config.name is not None and setting_fault(WorldName, config.name):
+        raise UsageError(
+            f"--name must have letters, digits, hyphens, dots and underscores, found {shown(config.name)}"
+        )
     if config.goal is not None and ":" not in config.goal:
         raise UsageError(
-            f"--goal must name a function as module:function, found {config.goal!r}; write "
-            f"--goal my_module:{config.goal}"
+            f"--goal must name a function as module:function, found {shown(config.goal)}; give "
+            "the module, too"
         )
     if len(set(config.goal_columns)) < len(config.goal_columns):
         raise UsageError("--goal-columns names a component twice; leave one of them out")
     low, high = config.action_low, config.action_high
     if len(low) != len(high):
         raise UsageError(
-            f"--action-low and --action-high must have as many numbers, found {len(low)} and {len(high)}"
+            f"--action-low and --action-high must have as many numbers, found {_shown(low) or 'none'} and "
+            f"{_shown(high) or 'none'}"
         )
     if any(a >= b for a, b in zip(low, high, strict=True)):
         raise UsageError("--action-low must be below --action-high in every component")
+
+
+def _shown(value: Any) -> str:
+    """A name, or numbers, as they were given."""
+    if isinstance(value, tuple):
+        return " ".join(f"{number:g}" for number in value)
+    return shown(value)
 
 
 def require_folder(folder: Path | None, what: str) -> Path:

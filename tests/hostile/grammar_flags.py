@@ -33,6 +33,9 @@ ZERO_IS_FINE = {
 OF_THE_WORLD = {"head", "encoder"}
 """Flags of which a world may refuse choices that others take."""
 
+FREE = {"name"}
+"""Flags that give something a name, of which most words are one."""
+
 OUTPUTS = {"out", "json"}
 """Flags that name what is written."""
 
@@ -356,7 +359,7 @@ def _bad_values(flag: Flag) -> list[tuple[str, Expected]]:
     elif str in flag.kinds and not numbers:
         # What is named on the command line may be imported, and no word of it can hold a zero byte.
         names = [name for name in NAMES if ":" not in name and "\x00" not in name]
-        values += [(name, "refused") for name in names]
+        values += [(name, "either" if flag.name in FREE else "refused") for name in names]
     if Path in flag.kinds:
         if flag.name in OUTPUTS:
             values += [
