@@ -235,6 +235,8 @@ def explained(error: BaseException, config: Any = None) -> str:
         if isinstance(cause, OSError) and cause.errno in (errno.EACCES, errno.EROFS, errno.EPERM):
             what = cause.filename or "a file"
             return f"{what} cannot be read or written ({cause.strerror}); change its rights"
+        if isinstance(cause, FileExistsError):  # such as a link to nowhere in place of a folder
+            return f"{cause.filename} exists already and is no folder; remove it or choose another place"
         if isinstance(cause, OSError) and cause.errno == errno.ENAMETOOLONG:
             where = _flag_of(config, cause.filename)
             return f"{where}the name {shown(cause.filename)} is too long; choose a shorter one"
