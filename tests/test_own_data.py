@@ -353,7 +353,10 @@ def test_bad_episodes_can_be_left_out():
             "episode 0 has no array named 'goals'; give --goal-array one of actions, ",
         ),
         ({"goal_columns": (0,), "obs_arrays": ("state",)}, "episode 0 has no array named 'state'"),
-        ({"goal_columns": (0,), "goal_array": "x"}, "--goal-columns 0 and --goal-array .x. both say"),
+        (
+            {"goal_columns": (0,), "goal_array": "x"},
+            "--goal-columns 0 and --goal-array .x. both say",
+        ),
         ({"goal_columns": (0, 0)}, "names a component twice"),
         ({"goal": "half"}, "as module:function, found 'half'"),
         ({"goal_columns": (0,), "action_low": (0.0,)}, "must have as many numbers"),
