@@ -16,12 +16,13 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = "docs"
-ROOT_PAGES = {
+PAGES = {
     "README.md": "index.md",
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
+    "docs/tour.ipynb": "tour.md",
 }
-"""Files of the repository that are pages of the site."""
+"""Files of the repository that are pages of the site under another name."""
 MODULES = (
     "envs.base",
     "envs.registry",
@@ -31,7 +32,6 @@ MODULES = (
 )
 """Modules that users extend; each has a page of the reference to itself."""
 PACKAGE = "mgpo_jax"
-TOUR = "tour.ipynb"
 OUTSIDE = re.compile(r"[a-z][a-z0-9+.-]*:", re.IGNORECASE)  # http:, mailto:, data:
 
 SECTIONS: tuple[tuple[str, Sequence[str]], ...] = (
@@ -76,8 +76,8 @@ def navigation(pages: Sequence[str]) -> list[dict[str, Any]]:
 
 def place_in_site(path: str) -> str | None:
     """Where a file of the repository is in the site; None if it is not there."""
-    if path in ROOT_PAGES:
-        return ROOT_PAGES[path]
+    if path in PAGES:
+        return PAGES[path]
     folder, _, name = path.partition("/")
     return name if folder == DOCS and name else None
 
@@ -172,7 +172,8 @@ def tour_page(notebook: dict[str, Any]) -> str:
         for output in cell["outputs"]:
             data = output.get("data", {})
             if "image/png" in data:
-                blocks.append(f"![](data:image/png;base64,{''.join(data['image/png']).strip()})")
+                picture = "".join(data["image/png"]).strip()
+                blocks.append(f"![what the code above draws](data:image/png;base64,{picture})")
             elif text := "".join(output.get("text", data.get("text/plain", []))).rstrip():
                 blocks.append(f"```text\n{text}\n```")
     return "\n\n".join(blocks) + "\n"
@@ -183,10 +184,11 @@ def on_files(files: Any, config: Any) -> Any:
     from mkdocs.structure.files import File
 
     made = dict(reference())
-    for source, page in ROOT_PAGES.items():
-        made[page] = links_in_site((ROOT / source).read_text(), source)
-    if (notebook := ROOT / DOCS / TOUR).is_file():
-        made["tour.md"] = tour_page(json.loads(notebook.read_text()))
+    for source, page in PAGES.items():
+        if (path := ROOT / source).is_file():
+            text = path.read_text()
+            text = tour_page(json.loads(text)) if path.suffix == ".ipynb" else text
+            made[page] = links_in_site(text, source)
     for page, text in made.items():
         files.append(File.generated(config, page, content=text))
     config.nav = navigation([file.src_uri for file in files.documentation_pages()])

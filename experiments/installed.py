@@ -16,7 +16,7 @@ from mgpo_jax.released import released_folder
 DISTRIBUTION = "mgpo-jax"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 OF_EXTRA = re.compile(r"extra\s*==\s*['\"]([^'\"]+)['\"]")
-INDIRECT = ("all", "dev", "docs")  # extras for developers, and those made of others
+INDIRECT = ("all", "dev", "docs", "notebook")  # extras for developers, and those made of others
 
 
 class Extra(NamedTuple):

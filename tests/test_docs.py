@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import re
 import subprocess
@@ -22,7 +23,8 @@ PAGES = [
     ROOT / "CHANGELOG.md",
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
-TOUR = ROOT / "docs" / "tour.ipynb"
+TOUR = ROOT / "docs" / "tour.py"
+PICTURES_MAX = 400_000  # bytes of all pictures in the tour, as text
 FENCED = re.compile(r"^```.*?^```[^\n]*$", re.DOTALL | re.MULTILINE)
 LINK = re.compile(r"\[(?:[^\[\]]|\[[^\]]*\])*\]\(([^()\s]+)\)")
 PICTURE = re.compile(r"<(?:img|a)\b[^>]*(?:src|href)=\"([^\"]+)\"")
@@ -154,3 +156,58 @@ def test_the_site_builds_without_a_warning_and_loads_nothing_from_elsewhere(tmp_
             assert loading.findall(page.read_text()) == [], page
     assert (tmp_path / "guides" / "own-data.html").is_file()
     assert 'id="mgpo_jax.acting.Actor"' in (tmp_path / "api" / "mgpo_jax.html").read_text()
+
+
+def cells_of(script: str) -> list[tuple[str, str]]:
+    """Kind and source of the cells of a script in the percent format."""
+    cells = []
+    for part in re.split(r"^# %%", script, flags=re.MULTILINE)[1:]:
+        head, _, body = part.partition("\n")
+        if head.strip() == "[markdown]":
+            body = re.sub(r"^# ?", "", body, flags=re.MULTILINE)
+        cells.append(("markdown" if head.strip() else "code", body.strip()))
+    return cells
+
+
+def test_the_notebook_of_the_tour_is_that_of_its_script() -> None:
+    notebook = json.loads(TOUR.with_suffix(".ipynb").read_text())
+    found = [(cell["cell_type"], "".join(cell["source"]).strip()) for cell in notebook["cells"]]
+    assert found == cells_of(TOUR.read_text()), "make it again; its first cell says how"
+
+
+def test_the_notebook_has_its_outputs() -> None:
+    notebook = json.loads(TOUR.with_suffix(".ipynb").read_text())
+    outputs = [output for cell in notebook["cells"] for output in cell.get("outputs", [])]
+    assert not [output for output in outputs if output["output_type"] == "error"]
+    pictures = [
+        output["data"]["image/png"] for output in outputs if "image/png" in output.get("data", {})
+    ]
+    assert len(pictures) == 7
+    assert sum(map(len, pictures)) < PICTURES_MAX
+    text = hooks().tour_page(notebook)
+    assert text.count("![what the code above draws](data:image/png;base64,") == 7
+    assert "```text\ntarget (row, column)" in text
+    assert list(faults_of(TOUR, text)) == []
+
+
+@pytest.mark.parametrize(
+    "methods",
+    # Most of what the plan takes here is compilation.
+    [["ucb"], pytest.param(["ucb", "plan"], marks=pytest.mark.slow)],
+    ids=" ".join,
+)
+def test_the_tour_runs(methods: list[str]) -> None:
+    env = {
+        **os.environ,
+        "TOUR_EPISODES": "4",
+        "TOUR_METHODS": " ".join(methods),
+        "XLA_FLAGS": "",  # one device compiles less
+        "MPLBACKEND": "Agg",
+        "PYTHONPATH": str(ROOT),
+    }
+    command = [sys.executable, "-W", "error::DeprecationWarning:__main__", str(TOUR)]
+    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert lines[0].startswith("target (row, column):")
+    assert [line.split(":")[0] for line in lines[2:]] == methods
