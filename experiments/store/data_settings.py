@@ -147,7 +147,7 @@ def check_import(config: ImportConfig) -> None:
 def _shown(value: Any) -> str:
     """A name, or numbers, as they were given."""
     if isinstance(value, tuple):
-        return " ".join(f"{number:g}" for number in value)
+        return " ".join(map(repr, value))
     return shown(value)
 
 
