@@ -26,6 +26,7 @@ from experiments import runtime, training
 from experiments.parsing import parse
 from experiments.store.runs import begin, check_start, has_begun, identity
 from experiments.store.settings import (
+    DEFAULT_WORLD,
     PretrainConfig,
     initial_at,
     pretrain_default,
@@ -460,7 +461,7 @@ def test_a_policy_that_is_replaced_while_it_is_copied_is_noticed(here: Path) -> 
 
 
 def test_the_hash_of_the_weights_is_part_of_what_a_run_is() -> None:
-    config = PretrainConfig()
+    config = PretrainConfig(env=DEFAULT_WORLD)
     # Runs from random weights keep the identity that they had before there were others.
     assert identity(config, "ab") == hashlib.sha256(b'[{}, "ab"]').hexdigest()
     assert identity(config, "ab", "cd") == hashlib.sha256(b'[{}, "ab", "cd"]').hexdigest()
