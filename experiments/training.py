@@ -285,11 +285,13 @@ class Run:
         self.truncate = spec.truncate_in_hindsight
         longest = spec.horizon if own is None else int(dataset.lengths.max())
         self._held_out_parts = self._validation_parts(held_out, longest)
-        self._returns_on_the_way = self._watched(env)
         self.identity = runs.identity(config, sha256, init.sha256 if init else "")
         meta = {**meta, "dataset": str(place), "dataset_sha256": sha256, **self.origin}
-        if runs.has_begun(self.folder):
+        if begun := runs.has_begun(self.folder):
             runs.check_same(config, meta)
+        expect_compiling()
+        self._returns_on_the_way = self._watched(env)
+        if begun:
             runs.keep_initial(config, meta)
             if (trained := runs.prolonged(config)) is not None:
                 runs.note_prolonged(config, trained)
@@ -375,7 +377,6 @@ def train(config: PretrainConfig, go_on: str = "continue with --resume") -> None
             if runs.is_finished(folder) and runs.prolonged(config) is None:
                 print(f"{folder} is finished already", file=sys.stderr)
                 return
-        expect_compiling()
         run = Run(config, go_on)
         with checkpoints(run.folder / runs.CHECKPOINTS) as manager:
             blank = run.initial_state()

@@ -1,10 +1,10 @@
 """One HTML file of JavaScript modules, a style sheet and data, which opens without a server or a network.
 
-Modules are joined as they are: each becomes a function whose result are its exports, so that no two of
-them share a name. Of the module syntax there is ``import { a, b } from "./x.js"`` on one line, and
-``export`` before ``const``, ``function`` and ``class``. The page's Content-Security-Policy allows its own
-script and style by their hashes, and pictures within the file. Data enters as JSON that no parser of HTML
-can mistake for markup.
+Modules are joined as they are, but for the comments that hold their types (JSDoc). Each becomes a
+function whose result are its exports, so that no two of them share a name. Of the module syntax there is
+``import { a, b } from "./x.js"`` on one line, and ``export`` before ``const``, ``function`` and
+``class``. The page's Content-Security-Policy allows its own script and style by their hashes, and
+pictures within the file. Data enters as JSON that no parser of HTML can mistake for markup.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from typing import Any
 SCRIPTS = Path(__file__).parent / "js"
 IMPORT = re.compile(r'^import \{ (\w+(?:, \w+)*) \} from "(\./[\w-]+\.js)";$', re.M)
 EXPORT = re.compile(r"^export (?=(?:const|(?:async )?function\*?|class) (\w+))", re.M)
+TYPES = re.compile(r"^[ \t]*/\*\*.*?\*/[ \t]*\n", re.M | re.S)
 OTHER_SYNTAX = re.compile(r"^(?:import|export)\b.*$", re.M)
 
 
@@ -40,7 +41,7 @@ class Bundle:
         if path in above:
             raise ValueError(f"{path.name} imports itself through {above[-1].name}")
         if path not in self._names:
-            source = path.read_text(encoding="utf-8")
+            source = TYPES.sub("", path.read_text(encoding="utf-8"))
 
             def imported(match: re.Match[str]) -> str:
                 of = self.add(path.parent / match[2], (*above, path))
