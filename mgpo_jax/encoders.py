@@ -95,8 +95,12 @@ def _looked_up(
 ) -> Float[Array, "*batch E"]:
     """The token plus some rows of each cell's table.
 
-    Cell by cell: all rows at once would be written to memory, and their gradient scattered over all tables.
+    On a CPU this goes cell by cell: all rows at once would be written to memory, and their gradient
+    scattered over all tables. An accelerator is slow at scattering and fast at products
+    (``_multiplied_out``).
     """
+    if jax.default_backend() != "cpu":
+        return _multiplied_out(token, tables, rows)
 
     def add(token: Array, cell: tuple[Array, Array]) -> tuple[Array, None]:
         table, rows = cell
@@ -105,6 +109,16 @@ def _looked_up(
         return token, None
 
     return jax.lax.scan(add, token, (tables, jnp.moveaxis(rows, -2, 0)))[0]
+
+
+def _multiplied_out(
+    token: Float[Array, "*batch E"],
+    tables: Float[Array, "cells rows E"],
+    rows: Int[Array, "*batch cells digits"],
+) -> Float[Array, "*batch E"]:
+    """What ``_looked_up`` returns, as one product with one-hots, so that its gradient is a product, too."""
+    hot = jax.nn.one_hot(rows, tables.shape[1], dtype=tables.dtype).sum(axis=-2)
+    return token + jnp.einsum("...cr,cre->...e", hot, tables)
 
 
 def layout_fault(layout: ObsLayout, shape: tuple[int, ...]) -> str | None:

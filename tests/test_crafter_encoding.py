@@ -44,9 +44,18 @@ def observations(number=64, *, light=None, asleep=0.0, seed=0):
     return jnp.asarray(obs)
 
 
-@pytest.fixture(scope="module")
-def layer():
-    """The encoder with random weights, and the dense layer with the same ones, both compiled."""
+@pytest.fixture(scope="module", params=["cpu", "gpu"])
+def layer(request):
+    """The encoder with random weights, and the dense layer with the same ones, both compiled.
+
+    Once as CPUs compute it and once as accelerators do.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jax, "default_backend", lambda: request.param)
+        yield compiled_layers()
+
+
+def compiled_layers():
     encoder = Picture(WIDTH)
     params = encoder.init(jax.random.key(0), observations(1))
     kernel, bias = params["params"]["kernel"], jnp.arange(float(WIDTH))

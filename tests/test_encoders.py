@@ -105,8 +105,10 @@ def dense_kernel(params):
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 @pytest.mark.parametrize("lead", [(), (4,), (2, 3)])
-def test_cells_are_a_dense_layer_on_one_hots(layout, lead):
-    """Its values, and its gradient with respect to the weights."""
+@pytest.mark.parametrize("backend", ["cpu", "gpu"])
+def test_cells_are_a_dense_layer_on_one_hots(monkeypatch, layout, lead, backend):
+    """Its values, and its gradient with respect to the weights, as CPUs and accelerators compute them."""
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
     obs = coded(layout, lead)
     encoder = ENCODERS.find("cells").make((11,), 5, layout)
     params = encoder.init(jax.random.key(0), obs)

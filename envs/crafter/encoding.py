@@ -109,7 +109,8 @@ def _with_cells(
 ) -> Float[Array, "*batch E"]:
     """The token plus what the cells in view look like, with weights for being awake and asleep.
 
-    Cell by cell: what all cells look like at once would fill the memory.
+    On a CPU this goes cell by cell: what all cells look like at once would fill the memory. An accelerator
+    is slow at scattering the gradient over the tables and fast at products (``multiplied_out``).
     """
     codes = jnp.clip(jnp.round(obs[..., :NUM_CELLS]), 0, NUM_CODES - 1).astype(jnp.int32)
     asleep = (obs[..., ASLEEP] > 0.5).astype(jnp.int32)
@@ -122,12 +123,18 @@ def _with_cells(
     others = np.delete(np.arange(NUM_CELLS), MIDDLE)
     rows = jnp.moveaxis(codes[..., others], -1, 0)
     # All tables outside of the loop: they follow from the weights alone, and an episode makes them once.
-    token, _ = jax.lax.scan(add, token, (tables("day", kernels[:, others]), rows))
+    of_cells = tables("day", kernels[:, others])
+    if jax.default_backend() == "cpu":
+        token, _ = jax.lax.scan(add, token, (of_cells, rows))
+    else:
+        token = token + multiplied_out(of_cells, codes[..., others], light, asleep)
     facing = jnp.argmax(obs[..., NUM_CELLS + NUM_COUNTS :][..., :NUM_FACINGS], axis=-1)
     who = jnp.where(asleep > 0, NUM_FACINGS, facing)
     row = who * NUM_BLOCKS + codes[..., MIDDLE] % NUM_BLOCKS
-    (table,) = tables("player", kernels[:, MIDDLE : MIDDLE + 1])
-    return token + looked_up(table, Shown(row, light, asleep))
+    of_player = tables("player", kernels[:, MIDDLE : MIDDLE + 1])
+    if jax.default_backend() == "cpu":
+        return token + looked_up(of_player[0], Shown(row, light, asleep))
+    return token + multiplied_out(of_player, row[..., None], light, asleep)
 
 
 def tables(kind: str, kernels: Float[Array, "2 cells TILE E"]) -> Float[Array, "cells 2 2 rows E"]:
@@ -152,6 +159,26 @@ def looked_up(table: Float[Array, "2 2 rows E"], shown: Shown) -> Float[Array, "
     return shown.light * day + (1 - shown.light) * night
 
 
+def multiplied_out(
+    tables: Float[Array, "cells 2 2 rows E"],
+    rows: Int[Array, "*batch cells"],
+    light: Float[Array, "*batch 1"],
+    asleep: Int[Array, "*batch"],
+) -> Float[Array, "*batch E"]:
+    """The sum of ``looked_up`` over cells, as a product with one-hots, so that its gradient is a product, too.
+
+    Args:
+      tables: those of the cells.
+      rows: the number of the tile that is shown at each cell.
+      light, asleep: as in ``Shown``.
+    """
+    hot = jax.nn.one_hot(rows, tables.shape[-2], dtype=tables.dtype)
+    by_light = jnp.einsum("...cr,cslre->...sle", hot, tables)
+    lights = jnp.concatenate([light, 1 - light], axis=-1)
+    states = jax.nn.one_hot(asleep, 2, dtype=tables.dtype)
+    return jnp.einsum("...s,...l,...sle->...e", states, lights, by_light)
+
+
 def _with_items(
     token: Float[Array, "*batch E"],
     places: Float[Array, "places TILE E"],
@@ -163,5 +190,9 @@ def _with_items(
     for place, name in enumerate(ITEMS):
         index = COUNTS.index(name)
         table = jnp.asarray(shown[index], jnp.float32) @ places[place]
-        token = token + table[jnp.clip(counts[..., index], 0, MAX_COUNT)]
+        shown_count = jnp.clip(counts[..., index], 0, MAX_COUNT)
+        if jax.default_backend() == "cpu":
+            token = token + table[shown_count]
+        else:  # for the reason given in ``_with_cells``
+            token = token + jax.nn.one_hot(shown_count, MAX_COUNT + 1, dtype=table.dtype) @ table
     return token
