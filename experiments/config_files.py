@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any, get_args
 
 from envs.errors import DataError, UsageError, shown
+from experiments.joining import OF_PROCESSES
 from mgpo_jax.schema import Json, read_document
 from mgpo_jax.settings import flag, is_settings, types_of
 
-OWN = frozenset({"config", "debug", "dry_run", "json", "out", "quiet", "resume"})
+OWN = frozenset({"config", "debug", "dry_run", "json", "out", "quiet", "resume", *OF_PROCESSES})
 """Settings of one call of a command, which another one does not take over."""
 GROUPS = frozenset({"data", "train", "hyper"})
 """Groups of settings in ``config.json``, whose flags are those of their members."""

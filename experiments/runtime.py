@@ -20,6 +20,7 @@ import platform
 import sys
 import tempfile
 import threading
+import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -30,6 +31,7 @@ from typing import Any, NoReturn
 
 from envs.errors import DataError, UsageError, printable, shown
 from experiments import signals
+from mgpo_jax import processes
 from mgpo_jax.claims import NO_ROOM, check_place
 from mgpo_jax.settings import flag
 
@@ -37,6 +39,8 @@ OF_CALLBACK = "INTERNAL: Error when calling buffer callback"
 """How jax begins its message of an error in a function that a program called on the host."""
 
 EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
+NEWS = 3.0
+"""Seconds after an error of one of several processes in which news may come that another is to blame."""
 
 # mallopt parameters of the GNU C library
 M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -2, -3, -8
@@ -140,13 +144,17 @@ def run(
             with _silence() if config.quiet else nullcontext():
                 configure()
                 main(config)
+                _part()
     except signals.Stopped as stop:
+        _part()
         _fail(str(stop), 128 + stop.number, debug, "")
     except KeyboardInterrupt:
         sys.exit(EXIT_INTERRUPTED)
     except (UsageError, DataError) as error:
         _fail(str(error), EXIT_USAGE if isinstance(error, UsageError) else EXIT_FAILED, debug)
     except Exception as error:
+        if processes.team() is not None:
+            time.sleep(NEWS)
         too_long = isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG
         _fail(explained(error, config), EXIT_USAGE if too_long else EXIT_FAILED, debug)
     sys.exit(0)
@@ -188,7 +196,7 @@ class _Tolerant:
         return getattr(self._stream, name)
 
 
-class _Silent(_Tolerant):
+class Silent(_Tolerant):
     """A stream that shows nothing."""
 
     def write(self, text: str) -> int:
@@ -198,7 +206,7 @@ class _Silent(_Tolerant):
 @contextmanager
 def _silence() -> Iterator[None]:
     """Show nothing of what is written to stderr; an error that leaves the block is shown after it."""
-    stream, sys.stderr = sys.stderr, _Silent(sys.stderr)
+    stream, sys.stderr = sys.stderr, Silent(sys.stderr)
     try:
         yield
     finally:
@@ -277,11 +285,22 @@ def program_name() -> str:
     return f"python -m experiments.{stem}"
 
 
+def _part() -> None:
+    """Wait until all processes of this command have come to its end."""
+    if (team := processes.team()) is not None:
+        team.leave(wait=True)
+
+
 def _fail(message: str, code: int, debug: bool, prefix: str = "error: ") -> NoReturn:
     if debug:
         traceback.print_exc()
-    if sys.stderr is not None:
-        print(f"{prefix}{printable(message)}", file=sys.stderr)
+    line = f"{prefix}{printable(message)}"
+    if (team := processes.team()) is not None and prefix:
+        from experiments.joining import leave_failed
+
+        leave_failed(team, line, message, code)
+    if sys.stderr is not None and processes.is_first():
+        print(line, file=sys.stderr)
     sys.exit(code)
 
 

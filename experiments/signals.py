@@ -4,6 +4,9 @@ The operating system tells a thread of its own about a signal, at once even whil
 inside a compiled program. What happens then depends on what the command is doing: it is left at once, after
 cleaning up, or (``asked_to_stop``) it is asked to stop at its next chance. The second request always ends
 it at once. All exit with 128 plus the signal's number.
+
+Where several processes run one command (``experiments.joining``), a request to one of them is one to all.
+A scheduler, or a terminal, may send each of them its own: those count as one request.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ import signal
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
@@ -42,18 +46,27 @@ class _Watch:
     def forget(self) -> None:
         """Be as if no signal had come and no command were running."""
         self.asked: list[int] = []
+        self.times: Counter[int] = Counter()  # requests by the number of the process that got them
         self.farewell: Callable[[], str] = lambda: ""
+        self.tell: Callable[[int], None] = lambda number: None
+        self.outlast: Callable[[], None] = lambda: None
         self.patient = False
         self.leaving = False
 
-    def receive(self, number: int) -> None:
-        """React to a signal; returns at once, so that the next one can be received."""
+    def receive(self, number: int, process: int = 0) -> None:
+        """React to a signal; returns at once, so that the next one can be received.
+
+        ``process`` is 0 for this one, else the place of another that got the signal.
+        """
         self.asked.append(number)
-        if self.leaving:
+        self.times[process] += 1
+        again = self.times[process] > 1
+        if self.leaving and again:
             os._exit(128 + number)
-        elif self.patient and len(self.asked) == 1:
-            _say("stopping soon; a second request ends it at once")
-        else:
+        elif self.patient and not again:
+            if len(self.asked) == 1:
+                _say("stopping soon; a second request ends it at once")
+        elif not self.leaving:
             self.leaving = True
             threading.Thread(target=self._leave, args=(number,), daemon=True).start()
 
@@ -65,6 +78,7 @@ class _Watch:
             if not self.patient and (text := self.farewell()):
                 _say(text)
             clean_up()
+            self.outlast()
         finally:
             os._exit(128 + number)
 
@@ -118,7 +132,26 @@ def _hold(number: int, frame: FrameType | None) -> None:
 def _listen(reading: int) -> None:
     while number := os.read(reading, 1)[0]:
         if number in SIGNALS:
+            _watch.tell(number)
             _watch.receive(number)
+
+
+def tell_others(tell: Callable[[int], None], outlast: Callable[[], None]) -> None:
+    """Call ``tell`` with the number of every signal that comes, and ``outlast`` before it ends the process.
+
+    ``outlast`` waits for other processes that end before this one may.
+    """
+    _watch.tell, _watch.outlast = tell, outlast
+
+
+def receive(number: int, process: int) -> None:
+    """React to a signal that another process got; ``process`` tells apart who."""
+    _watch.receive(number, 1 + process)
+
+
+def is_leaving() -> bool:
+    """Whether this process is about to end because of a signal."""
+    return _watch.leaving
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from pydantic import BaseModel
 
 import envs
 from envs.errors import DataError, UsageError, nearest, shown
-from experiments.runtime import Common
+from experiments.joining import OF_PROCESSES, Joined
 from experiments.store.layout import CONFIG
 from mgpo_jax.kinds import KINDS, MULTI_GOAL
 from mgpo_jax.manifest import read_facts
@@ -64,7 +64,7 @@ def data_root() -> Path:
 
 
 @dataclass(frozen=True)
-class CollectConfig(Common):
+class CollectConfig(Joined):
     """Settings of ``experiments.collect``."""
 
     env: Name = DEFAULT_WORLD
@@ -105,7 +105,7 @@ class DataConfig:
 
 
 @dataclass(frozen=True)
-class PretrainConfig(Common):
+class PretrainConfig(Joined):
     """Settings of ``experiments.pretrain``; values in brackets are the paper's."""
 
     env: Name = NO_WORLD
@@ -412,7 +412,7 @@ def check_initial(config: PretrainConfig) -> None:
 NO_SETTINGS = frozenset(
     {
         "preset", "init", "out", "resume", "debug", "quiet", "config", "dry_run", "tb", "wandb",
-        "eval_every", "save_every", "data_folder",
+        "eval_every", "save_every", "data_folder", *OF_PROCESSES,
     }
 )  # fmt: skip
 """Settings that may differ when a run is resumed: they do not change its weights. For the places of data
@@ -477,7 +477,7 @@ def _from_json(settings_class: type, values: Any, where: Path) -> Any:
 
 
 @dataclass(frozen=True)
-class AdaptConfig(Common):
+class AdaptConfig(Joined):
     """Settings of ``experiments.adapt``; values in brackets are the paper's."""
 
     env: Name = DEFAULT_WORLD
@@ -537,7 +537,7 @@ class AdaptConfig(Common):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReproduceConfig(Common):
+class ReproduceConfig(Joined):
     """Settings of ``experiments.reproduce``."""
 
     what: tyro.conf.Positional[str] = ""
@@ -603,6 +603,11 @@ LIST, ALL = "list", "all"
 
 def check_reproduction(config: ReproduceConfig) -> None:
     """Raise ``UsageError`` for settings of ``experiments.reproduce`` that do not go together."""
+    if config.distributed and config.what not in COMPARISONS:
+        raise UsageError(
+            f"--distributed spreads the cells of a comparison; {config.what} is made by one process, leave it "
+            f"out or name one of {', '.join(COMPARISONS)}"
+        )
     if config.what not in ABLATIONS:
         useless = ["steps", "trajectories"]
         useless += ["only"] if config.what not in COMPARISONS else []

@@ -1,0 +1,380 @@
+"""The processes that run one command together: who they are, and what they tell each other on the host.
+
+Process 0 has a connection to each of the others. What is small or has no fixed size goes through it: facts
+that must agree, finished pieces of work, requests to stop, and the news that a process has failed. The
+operating system closes the connections of a process that ends, however it ends, so that the others learn
+of it at once, which a collective on devices does not promise. Gradients and lanes go another way
+(``mgpo_jax.sharding``). A command without ``--distributed`` is one process, and everything here is then
+answered without any connection. Nothing here imports jax.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import queue
+import secrets
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+
+from envs.errors import DataError, shown
+
+Value = TypeVar("Value")
+
+MEETING = 60.0  # seconds in which all processes must have connected
+SILENT, PROBES, BETWEEN = (
+    10,
+    3,
+    5,
+)  # seconds, number and seconds: when a host that is gone counts as gone
+
+_HEAD = struct.Struct(">cIQ")  # kind, number of the process it is from, bytes that follow
+_PIECE, _DONE, _SIGNAL, _FAILED, _GONE = b"p", b"d", b"s", b"f", b"g"
+SIGNAL, FAILED, GONE = "signal", "failed", "gone"
+_EVENTS = {_SIGNAL: SIGNAL, _FAILED: FAILED, _GONE: GONE}
+
+
+class DisagreementError(DataError):
+    """Processes that must do the same were started differently. All of them raise it, process 0 says it."""
+
+
+class Member(NamedTuple):
+    """One of the processes."""
+
+    number: int
+    host: str
+    pid: int
+
+    def __str__(self) -> str:
+        return f"process {self.number} on {self.host}"
+
+
+class Team:
+    """The processes of one command, as one of them sees them.
+
+    Args:
+      members: all of them, in order.
+      index: which of them this one is.
+      links: connections by the number of the process at the other end: of process 0 to all others, of the
+        others to process 0.
+      heard: ``(event, member, text)``, called in another thread when a process is asked to stop by a
+        signal (``SIGNAL``; the text is its number), fails (``FAILED``; why) or is gone (``GONE``).
+    """
+
+    def __init__(
+        self,
+        members: Sequence[Member],
+        index: int,
+        links: Mapping[int, socket.socket],
+        heard: Callable[[str, Member, str], None],
+    ) -> None:
+        self.members, self.index = members, index
+        self._links, self._heard = dict(links), heard
+        self._pieces: dict[int, queue.SimpleQueue[bytes]] = {
+            number: queue.SimpleQueue() for number in links
+        }
+        self._locks = {number: threading.Lock() for number in links}
+        self._done: set[int] = set()  # those that have nothing more to say
+        self._leaving = False
+        self._readers = [
+            threading.Thread(target=self._read, args=(number,), daemon=True) for number in links
+        ]
+        for reader in self._readers:
+            reader.start()
+
+    def combine(self, piece: bytes, make: Callable[[list[bytes]], bytes]) -> bytes:
+        """What process 0 makes of the pieces that all give, in their order; each must call this."""
+        if self.index:
+            self._send(0, _PIECE, piece)
+            return self._pieces[0].get()
+        made = make([piece, *(self._pieces[number].get() for number in sorted(self._links))])
+        for number in self._links:
+            self._send(number, _PIECE, made)
+        return made
+
+    def tell(self, event: str, text: str) -> None:
+        """Tell all others of a signal to this process, or of its failure."""
+        kind = next(kind for kind, name in _EVENTS.items() if name == event)
+        for number in self._links:
+            self._send(number, kind, text.encode())
+
+    def leave(self, wait: bool) -> None:
+        """End all connections, after everybody has come this far if ``wait``."""
+        if wait and self.index:
+            self._send(0, _DONE, b"")
+            self._pieces[0].get()
+        elif wait:
+            for number in self._links:
+                self._pieces[number].get()
+            for number in self._links:
+                self._send(number, _DONE, b"")
+        self._leaving = True
+        for link in self._links.values():
+            with suppress(OSError):
+                link.shutdown(socket.SHUT_RDWR)
+            link.close()
+
+    def outlast(self, seconds: float) -> None:
+        """Wait for the others to end, at most so long.
+
+        jax aborts a process, with pages of text, when process 0 ends before it without a farewell.
+        """
+        end = time.monotonic() + seconds
+        for reader in self._readers:
+            reader.join(max(end - time.monotonic(), 0))
+
+    def _send(self, number: int, kind: bytes, text: bytes, source: int | None = None) -> None:
+        source = self.index if source is None else source
+        # A connection that is broken is noticed by its reader, which knows what to do.
+        with suppress(OSError), self._locks[number]:
+            self._links[number].sendall(_HEAD.pack(kind, source, len(text)) + text)
+
+    def _read(self, number: int) -> None:
+        """Receive from one process until its connection ends."""
+        with suppress(OSError):
+            while head := _received(self._links[number], _HEAD.size):
+                kind, source, size = _HEAD.unpack(head)
+                text = _received(self._links[number], size)
+                if kind == _DONE:
+                    self._done.add(number)
+                if kind in (_PIECE, _DONE):
+                    self._pieces[number].put(text)
+                else:
+                    self._pass_on(kind, source, text)
+        if not self._leaving and number not in self._done:
+            self._pass_on(_GONE, number, b"")
+
+    def _pass_on(self, kind: bytes, source: int, text: bytes) -> None:
+        if not self.index:
+            for number in self._links:
+                if number != source:
+                    self._send(number, kind, text, source)
+        self._heard(_EVENTS[kind], self.members[source], text.decode(errors="replace"))
+
+
+def _received(link: socket.socket, size: int) -> bytes:
+    """So many bytes; none if the connection ends before."""
+    pieces = bytearray()
+    while len(pieces) < size:
+        piece = link.recv(min(size - len(pieces), 1 << 20))
+        if not piece:
+            return b""
+        pieces += piece
+    return bytes(pieces)
+
+
+def _packed(pieces: Sequence[bytes]) -> bytes:
+    return b"".join(struct.pack(">Q", len(piece)) + piece for piece in pieces)
+
+
+def _unpacked(text: bytes) -> Iterator[bytes]:
+    place = 0
+    while place < len(text):
+        (size,) = struct.unpack_from(">Q", text, place)
+        yield text[place + 8 : place + 8 + size]
+        place += 8 + size
+
+
+class Door:
+    """Where process 0 waits for the others; only who knows the password is let in."""
+
+    def __init__(self, only_here: bool) -> None:
+        self._listening = socket.create_server(("127.0.0.1" if only_here else "", 0))
+        self.password = secrets.token_bytes(16)
+        self.port = self._listening.getsockname()[1]
+
+    def let_in(self, members: Sequence[Member]) -> dict[int, socket.socket]:
+        """The connections of all others, by their numbers; the door is closed afterwards.
+
+        Raises:
+          DataError: if one of them does not come in time.
+        """
+        links: dict[int, socket.socket] = {}
+        end = time.monotonic() + MEETING
+        with self._listening:
+            while len(links) < len(members) - 1:
+                self._listening.settimeout(max(end - time.monotonic(), 0.01))
+                try:
+                    link, _ = self._listening.accept()
+                    link.settimeout(MEETING)
+                    said = _received(link, len(self.password) + 4)
+                except OSError:
+                    missing = next(one for one in members[1:] if one.number not in links)
+                    raise DataError(
+                        f"{missing} has not connected to process 0 on {members[0].host} within "
+                        f"{MEETING:.0f} s; see whether the network lets it"
+                    ) from None
+                if secrets.compare_digest(said[:-4], self.password):
+                    links[struct.unpack(">I", said[-4:])[0]] = _kept_alive(link)
+                else:
+                    link.close()
+        return links
+
+
+def connected(places: Sequence[str], port: int, password: bytes, index: int) -> socket.socket:
+    """The connection of a process to process 0, at the first of some names of its host that answers.
+
+    Raises:
+      DataError: if none answers.
+    """
+    fault = ""
+    for place in places:
+        try:
+            link = socket.create_connection((place, port), timeout=MEETING)
+            link.sendall(password + struct.pack(">I", index))
+            return _kept_alive(link)
+        except OSError as error:
+            fault = f"{place}:{port}: {error}"
+    raise DataError(f"process 0 cannot be reached at {fault}; see whether the network lets it")
+
+
+def _kept_alive(link: socket.socket) -> socket.socket:
+    """The connection, which ends soon after the host at its other end is gone."""
+    link.settimeout(None)
+    link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    link.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    milliseconds = 1000 * (SILENT + PROBES * BETWEEN)
+    for name, value in (
+        ("TCP_KEEPIDLE", SILENT),
+        ("TCP_KEEPINTVL", BETWEEN),
+        ("TCP_KEEPCNT", PROBES),
+        ("TCP_USER_TIMEOUT", milliseconds),
+    ):
+        if hasattr(socket, name):  # where it is missing, the system's own patience counts
+            link.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+    return link
+
+
+class _Present:
+    """Which processes work together at present."""
+
+    team: Team | None = None
+    apart = False
+
+
+_present = _Present()
+
+
+def join(team: Team | None) -> None:
+    """Be one of several processes from now on, or (None) the only one."""
+    _present.team = team
+
+
+def team() -> Team | None:
+    """The processes of this command; None if it is the only one."""
+    return _present.team
+
+
+def _together() -> Team | None:
+    return None if _present.apart else _present.team
+
+
+@contextmanager
+def apart() -> Iterator[None]:
+    """In the block this process works as if it were the only one, on devices of its own."""
+    before, _present.apart = _present.apart, True
+    try:
+        yield
+    finally:
+        _present.apart = before
+
+
+def count() -> int:
+    """How many processes work together."""
+    return len(now.members) if (now := _together()) else 1
+
+
+def index() -> int:
+    """The number of this process."""
+    return now.index if (now := _together()) else 0
+
+
+def is_first() -> bool:
+    """Whether this process is the one that prints, draws and writes."""
+    return index() == 0
+
+
+def exchange(piece: bytes) -> list[bytes]:
+    """The pieces that all processes give, in their order; each must call this."""
+    return list(_unpacked(combined(piece, _packed)))
+
+
+def combined(piece: bytes, make: Callable[[list[bytes]], bytes]) -> bytes:
+    """What process 0 makes of the pieces that all processes give, in their order; each must call this.
+
+    The others need not have what it keeps for itself.
+    """
+    return now.combine(piece, make) if (now := _together()) else make([piece])
+
+
+def total(number: float) -> float:
+    """The sum of a number over the processes."""
+    return sum(json.loads(text) for text in exchange(json.dumps(number).encode()))
+
+
+def from_first(find: Callable[[], Value]) -> Value:
+    """What process 0 finds, a JSON value, on every process."""
+    if count() == 1:
+        return find()
+    return json.loads(exchange(json.dumps(find()).encode() if is_first() else b"")[0])
+
+
+def arrays_from_first(
+    find: Callable[[], Mapping[str, np.ndarray] | None],
+) -> dict[str, np.ndarray] | None:
+    """The arrays that process 0 finds, on every process; None if it finds none."""
+    if count() == 1:
+        found = find()
+        return None if found is None else dict(found)
+    piece = b""
+    if is_first() and (found := find()) is not None:
+        piece = to_bytes(found)
+    told = exchange(piece)[0]
+    return from_bytes(told) if told else None
+
+
+def to_bytes(arrays: Mapping[str, np.ndarray]) -> bytes:
+    """Arrays by name as bytes."""
+    file = io.BytesIO()
+    named: Any = arrays
+    np.savez(file, allow_pickle=False, **named)
+    return file.getvalue()
+
+
+def from_bytes(text: bytes) -> dict[str, np.ndarray]:
+    """What ``to_bytes`` made bytes of."""
+    with np.load(io.BytesIO(text), allow_pickle=False) as file:
+        return dict(file)
+
+
+def check_agreed(facts: Mapping[str, Any]) -> None:
+    """Check that all processes have the same facts, JSON values by what they are.
+
+    Raises:
+      DisagreementError: on all of them, if one differs from process 0; it names both and what differs.
+    """
+    if (team := _together()) is None:
+        return
+    found = [json.loads(text) for text in exchange(json.dumps(dict(facts)).encode())]
+    for member, own in zip(team.members, found, strict=True):
+        if differing := [name for name in found[0] if own.get(name) != found[0][name]]:
+            said = "; ".join(
+                f"{name} {shown(own.get(name))}, not {shown(found[0][name])}" for name in differing
+            )
+            raise DisagreementError(
+                f"{member} has {said} as {team.members[0]} has; start all processes with the same "
+                "settings, programs and data"
+            )
+
+
+def own_name() -> tuple[str, int]:
+    """Host and process number, for the other processes."""
+    return socket.gethostname(), os.getpid()
