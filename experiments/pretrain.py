@@ -6,6 +6,7 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
+from experiments.joining import check_flags, join
 from experiments.runtime import run, say
 from experiments.store.runs import check_start
 from experiments.store.settings import PretrainConfig, check_pretraining, pretrain_default
@@ -14,9 +15,11 @@ from mgpo_jax.manifest import read_facts
 
 def main(config: PretrainConfig) -> None:
     """Pre-train the multi-goal Transformer on hindsight prompts."""
+    check_flags(config)
     check_pretraining(config)
     if not config.dry_run:
         check_start(config)
+        join(config)
     if config.data.data_folder is not None:
         from experiments.store.recipes import told
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -32,7 +34,15 @@ from experiments.store.settings import (
     initial_folder,
     mend_initial,
 )
-from mgpo_jax.checkpoint import Snapshot, checkpoints, restore_state, save_state
+from mgpo_jax import processes
+from mgpo_jax.checkpoint import (
+    Snapshot,
+    checkpoints,
+    hash_state,
+    restore_state,
+    save_state,
+    state_of_first,
+)
 from mgpo_jax.claims import claimed
 from mgpo_jax.dataset import BatchPlan, Dataset, spec_of
 from mgpo_jax.files import remove_unfinished, to_json, written
@@ -47,9 +57,10 @@ from mgpo_jax.rollout import rollout
 from mgpo_jax.runner import together
 from mgpo_jax.schema import let_go
 from mgpo_jax.settings import TrainConfig
-from mgpo_jax.sharding import device_mesh, largest_divisor
+from mgpo_jax.sharding import device_mesh, devices_for, fetch
 from mgpo_jax.tasks import EVAL_SEED, evaluation_tasks
 from mgpo_jax.training import (
+    ASKED,
     Trainer,
     TrainState,
     batch_stream,
@@ -277,7 +288,7 @@ class Run:
             else own_dataset(config, env)
         )
         self.network = configured_network(config, env, dataset, init, spec)
-        self.mesh = device_mesh(largest_divisor(config.train.part_size, len(jax.devices())))
+        self.mesh = device_mesh(devices_for(config.train.part_size))
         cut = len(dataset) - config.holdout
         self.fit, held_out = dataset.slice(0, cut), dataset.slice(cut, len(dataset))
         self.trainer = Trainer(config.train, self.network, self.fit, self.mesh)
@@ -285,22 +296,32 @@ class Run:
         self.truncate = spec.truncate_in_hindsight
         longest = spec.horizon if own is None else int(dataset.lengths.max())
         self._held_out_parts = self._validation_parts(held_out, longest)
-        self.identity = runs.identity(config, sha256, init.sha256 if init else "")
-        meta = {**meta, "dataset": str(place), "dataset_sha256": sha256, **self.origin}
-        if begun := runs.has_begun(self.folder):
-            runs.check_same(config, meta)
-        expect_compiling()
-        self._returns_on_the_way = self._watched(env)
-        if begun:
-            runs.keep_initial(config, meta)
-            if (trained := runs.prolonged(config)) is not None:
-                runs.note_prolonged(config, trained)
-                kept = runs.kept_policy(self.folder, trained)
-                text = _how_it_goes_on(config.train, trained)
-                print(f"{text}; the policy so far is kept in {kept}", file=sys.stderr)
-        else:  # only now, after everything that could be wrong with the settings
+        init_sha256 = init.sha256 if init else ""
+        self.identity = runs.identity(config, sha256, init_sha256)
+        self.identities = [self.identity]
+        self._returns_on_the_way: Callable[[Any], dict[str, float]] = lambda params: {}
+        processes.check_agreed({"the dataset's hash": sha256, "the hash of --init": init_sha256})
+        if processes.is_first():
+            meta = {**meta, "dataset": str(place), "dataset_sha256": sha256, **self.origin}
+            if begun := runs.has_begun(self.folder):
+                runs.check_same(config, meta)
+            expect_compiling()
+            self._returns_on_the_way = self._watched(env)
+            self._note(meta, begun)
+            self.identities = runs.identities(config, sha256, init_sha256)
+
+    def _note(self, meta: dict[str, Any], begun: bool) -> None:
+        """Note in the folder what the run is, after everything that could be wrong with the settings."""
+        config = self.config
+        if not begun:
             runs.begin(config, meta)
-        self.identities = runs.identities(config, sha256, init.sha256 if init else "")
+            return
+        runs.keep_initial(config, meta)
+        if (trained := runs.prolonged(config)) is not None:
+            runs.note_prolonged(config, trained)
+            kept = runs.kept_policy(self.folder, trained)
+            text = _how_it_goes_on(config.train, trained)
+            print(f"{text}; the policy so far is kept in {kept}", file=sys.stderr)
 
     def _watched(self, env: Environment | None) -> Callable[[Any], dict[str, float]]:
         """What is measured in the world on the way; nothing where there is none."""
@@ -353,7 +374,7 @@ class Run:
             self.config.train,
             self.fit,
             self.truncate,
-            self.mesh.devices.size,
+            self.mesh.devices.size * processes.count(),
             first_step=first_step,
         )
 
@@ -370,33 +391,59 @@ def train(config: PretrainConfig, go_on: str = "continue with --resume") -> None
       DataError: if a loss, weight or return is not finite; the last sound checkpoint is kept.
     """
     folder = config.folder
-    with claimed(folder), farewell(lambda: f"stopped; {go_on}" if runs.has_begun(folder) else ""):
-        remove_unfinished(folder)
-        if runs.has_begun(folder):
-            runs.check_start(config)
-            if runs.is_finished(folder) and runs.prolonged(config) is None:
-                print(f"{folder} is finished already", file=sys.stderr)
-                return
+    with (
+        claimed(folder) if processes.is_first() else nullcontext(),
+        farewell(lambda: f"stopped; {go_on}" if runs.has_begun(folder) else ""),
+    ):
+        if processes.from_first(lambda: _has_ended(config)):
+            print(f"{folder} is finished already", file=sys.stderr)
+            return
         run = Run(config, go_on)
-        with checkpoints(run.folder / runs.CHECKPOINTS) as manager:
-            blank = run.initial_state()
-            before = restore_state(manager, blank, run.identities) if config.resume else None
-            before = before or Snapshot(blank, [], [])
-            rows = before.measured
-            if rows is None:  # a checkpoint of an older version
-                rows = salvaged_rows(folder / METRICS, before.state.step)
-            if config.resume:
-                step = before.state.step
-                print(f"resuming {run.folder} at step {step}", file=sys.stderr)
-            metrics = Metrics(run.folder, config, rows)
-            with asked_to_stop() as stopping:
-                state = _take_steps(run, before, metrics, manager, stopping, go_on)
-        made = {"env": config.env, "config": to_json(config), "steps": state.step, **run.origin}
-        policy = run.folder / runs.POLICY
-        save_policy(policy, run.network, state.params, made)
-        with written(run.folder / runs.PICTURE) as picture:
-            training_curve(metrics.rows).savefig(picture)
+        if processes.is_first():
+            _train_and_save(run, go_on)
+        else:
+            _train_along(run, go_on)
+
+
+def _has_ended(config: PretrainConfig) -> bool:
+    """Whether a run needs no more steps; its folder is made ready for them otherwise."""
+    folder = config.folder
+    remove_unfinished(folder)
+    if runs.has_begun(folder):
+        runs.check_start(config)
+        return runs.is_finished(folder) and runs.prolonged(config) is None
+    return False
+
+
+def _train_and_save(run: Run, go_on: str) -> None:
+    """The steps of a training, and everything that is written."""
+    config, folder = run.config, run.folder
+    with checkpoints(folder / runs.CHECKPOINTS) as manager:
+        blank = run.initial_state()
+        before = restore_state(manager, blank, run.identities) if config.resume else None
+        before = before or Snapshot(blank, [], [])
+        rows = before.measured
+        if rows is None:  # a checkpoint of an older version
+            rows = salvaged_rows(folder / METRICS, before.state.step)
+        if config.resume:
+            print(f"resuming {folder} at step {before.state.step}", file=sys.stderr)
+        metrics = Metrics(folder, config, rows)
+        before = before._replace(state=state_of_first(before.state, blank))
+        with asked_to_stop() as stopping:
+            state = _take_steps(run, before, metrics, manager, stopping, go_on)
+    made = {"env": config.env, "config": to_json(config), "steps": state.step, **run.origin}
+    policy = folder / runs.POLICY
+    save_policy(policy, run.network, state.params, made)
+    with written(folder / runs.PICTURE) as picture:
+        training_curve(metrics.rows).savefig(picture)
     print(f"policy written to {policy}", file=sys.stderr)
+
+
+def _train_along(run: Run, go_on: str) -> None:
+    """The steps of a training in a process that is not the first: the same ones, and nothing is written."""
+    state = state_of_first(None, run.initial_state())
+    with asked_to_stop() as stopping:
+        _take_steps(run, Snapshot(state, [], []), None, None, stopping, go_on)
 
 
 def _how_it_goes_on(config: TrainConfig, trained: int) -> str:
@@ -415,12 +462,15 @@ def _how_it_goes_on(config: TrainConfig, trained: int) -> str:
 def _take_steps(
     run: Run,
     before: Snapshot,
-    metrics: Metrics,
+    metrics: Metrics | None,
     manager: Any,
     stopping: Callable[[], int],
     go_on: str,
 ) -> TrainState:
-    """All gradient steps that are left, with checkpoints and evaluations on the way."""
+    """All gradient steps that are left, with checkpoints and evaluations on the way.
+
+    Without ``metrics`` and ``manager`` nothing is measured or saved: process 0 does it.
+    """
     config, num_steps, state = run.config, run.config.train.steps, before.state
     batches = run.batches(state.step)
     # Means are taken in float32, also of what comes from a checkpoint.
@@ -429,25 +479,25 @@ def _take_steps(
     clock, since = time.process_time(), state.step
     with Progress(num_steps, "step", initial=state.step) as progress:
         while state.step < num_steps:
-            state, row = run.trainer.step(state, next(batches))
-            pending += [finite_metrics(*step) for step in newest]  # computed by now: no waiting
-            newest = [(state.step, row)]
+            state, row = run.trainer.step(state, next(batches), stopping())
+            known, newest = newest, [(state.step, row)]
+            pending += [finite_metrics(*step) for step in known]  # computed by now: no waiting
             progress.update()
-            number, done = stopping(), state.step == num_steps
+            number, done = _agreed(stopping(), known), state.step == num_steps
             saves = number or done or state.step % config.save_every == 0
             measures = done or state.step % config.eval_every == 0
             if saves or measures:
                 pending += [finite_metrics(*step) for step in newest]
                 newest = []
             if measures:
-                spent = {
-                    "cpu_seconds_per_step": (time.process_time() - clock) / (state.step - since)
-                }
-                row_out = {**_means(pending), **run.measure(state), **spent}
-                metrics.write(state.step, row_out)
-                progress.show(_shown(row_out))
+                spent = processes.total(time.process_time() - clock) / (state.step - since)
+                _check_together(state)
+                if metrics is not None:
+                    means = {**_means(pending), **run.measure(state)}
+                    metrics.write(state.step, {**means, "cpu_seconds_per_step": spent})
+                    progress.show(_shown(means))
                 pending, clock, since = [], time.process_time(), state.step
-            if saves:
+            if saves and metrics is not None:
                 left = [{k: float(v) for k, v in row.items()} for row in pending]
                 save_state(manager, Snapshot(state, metrics.rows, left), run.identity)
             if number and not done:
@@ -455,6 +505,27 @@ def _take_steps(
                 text = f"stopped at step {state.step} of {num_steps}; {go_on}"
                 raise Stopped(text, number)
     return state
+
+
+def _agreed(number: int, newest: Sequence[tuple[int, dict[str, Array]]]) -> int:
+    """The number of the signal that stops the training after this step, or 0.
+
+    A process by itself stops at once. Of several processes, each tells with its gradient whether it is
+    asked to stop; all read this one step later, when it is known, and stop after the same step.
+    """
+    if processes.count() == 1:
+        return number
+    asked = any(fetch(row[ASKED]) > 0 for _, row in newest)
+    return (number or signal.SIGTERM) if asked else 0
+
+
+def _check_together(state: TrainState) -> None:
+    """Raise ``DisagreementError`` if processes that train together have drifted apart.
+
+    Processors of different kinds run different programs, whose last bits differ.
+    """
+    if processes.count() > 1:
+        processes.check_agreed({f"the hash of the weights at step {state.step}": hash_state(state)})
 
 
 def _means(rows: list[dict[str, Any]]) -> dict[str, float]:

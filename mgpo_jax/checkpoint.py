@@ -1,7 +1,8 @@
 """Training checkpoints (Orbax): everything that a run needs to go on as if it had never stopped.
 
 A checkpoint holds its own hash and the identity of its run, so that one that is damaged, or of another run,
-is never gone on from.
+is never gone on from. Where several processes train together they have the same state: process 0 writes and
+reads it, and tells the others, so that a run can go on with another number of processes.
 """
 
 from __future__ import annotations
@@ -21,11 +22,12 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from envs.errors import DataError
+from mgpo_jax import processes
 from mgpo_jax.files import hash_arrays
 from mgpo_jax.sharding import fetch
 from mgpo_jax.training import TrainState
 
-_HASH, _IDENTITY, _ROWS = "sha256", "run", "rows"  # beside the leaves of the state
+_HASH, _IDENTITY, _ROWS, _STEP = "sha256", "run", "rows", "step"  # beside the leaves of the state
 DAMAGED = "-damaged"  # ends the name of the folder where checkpoints are set aside
 
 
@@ -41,7 +43,7 @@ class Snapshot(NamedTuple):
 
 @contextmanager
 def checkpoints(folder: Path, keep: int = 2) -> Iterator[ocp.CheckpointManager]:
-    """An Orbax manager. A save is on disk when it returns.
+    """An Orbax manager of this process alone. A save is on disk when it returns.
 
     It becomes visible only when it is complete: a process killed in the middle of one leaves the
     checkpoints before it.
@@ -54,8 +56,15 @@ def checkpoints(folder: Path, keep: int = 2) -> Iterator[ocp.CheckpointManager]:
         raise DataError(
             f"{folder} is no folder; remove it to start the training from its first step"
         )
+    folder.mkdir(parents=True, exist_ok=True)
+    own = processes.index()
     options = ocp.CheckpointManagerOptions(
-        max_to_keep=keep, create=True, enable_async_checkpointing=False
+        max_to_keep=keep,
+        create=False,
+        enable_async_checkpointing=False,
+        multiprocessing_options=ocp.options.MultiprocessingOptions(
+            primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
+        ),
     )
     with _quiet("absl", "asyncio"):
         manager = ocp.CheckpointManager(folder, options=options)
@@ -130,6 +139,39 @@ def restore_state(
     return None
 
 
+def state_of_first(state: TrainState | None, blank: TrainState) -> TrainState:
+    """The state that process 0 has, on every process.
+
+    Args:
+      state: that of process 0; nobody looks at those of the others.
+      blank: a state of the same network.
+    """
+    if processes.count() == 1:
+        assert state is not None
+        return state
+
+    def find() -> dict[str, np.ndarray]:
+        assert state is not None
+        return {**_named_leaves(state), _STEP: np.array(state.step)}
+
+    found = processes.arrays_from_first(find)
+    assert found is not None
+    step = int(found.pop(_STEP))
+    params, opt_state = _restored(found, blank)
+    return TrainState(params, opt_state, step)
+
+
+def hash_state(state: TrainState) -> str:
+    """SHA-256 of weights and of what the optimizer remembers."""
+    return hash_arrays(_named_leaves(state))
+
+
+def _restored(found: dict[str, np.ndarray], blank: TrainState) -> Any:
+    """Weights and optimizer's state from leaves by their paths."""
+    leaves = [jnp.asarray(found[name]) for name in _named_leaves(blank)]
+    return jax.tree.unflatten(jax.tree.structure((blank.params, blank.opt_state)), leaves)
+
+
 def _read(manager: ocp.CheckpointManager, step: int) -> Any:
     return manager.restore(step, args=ocp.args.StandardRestore())
 
@@ -163,7 +205,5 @@ def _snapshot(found: dict[str, np.ndarray], blank: TrainState, step: int, where:
     wanted = _named_leaves(blank)
     if {k: v.shape for k, v in found.items()} != {k: v.shape for k, v in wanted.items()}:
         raise DataError(f"checkpoint {where} is of another network; start a new run with --out")
-    leaves = [jnp.asarray(found[name]) for name in wanted]
-    tree = jax.tree.structure((blank.params, blank.opt_state))
-    params, opt_state = jax.tree.unflatten(tree, leaves)
+    params, opt_state = _restored(found, blank)
     return Snapshot(TrainState(params, opt_state, step), rows["measured"], rows["pending"])

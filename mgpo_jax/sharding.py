@@ -3,24 +3,56 @@
 One mesh with one axis serves pre-training, where trajectories are divided, and adaptation, where tasks
 and seeds are. On a CPU the devices are the cores (``experiments.runtime`` asks XLA for one device a core,
 because small programs on one core each waste less than one program on all).
+
+Where several processes work together (``mgpo_jax.processes``), each trains on its own devices and adds one
+row to the gradient; lanes are spread over the devices of all. **No collective ever runs between CPU devices
+of one process**: it waits for its peers on a thread of the pool that they need, and then stops for good.
+Collectives between processes do not, since each has a pool of its own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Float
+
+from envs.errors import UsageError
+from mgpo_jax import processes
 
 AXIS = "data"
 
 
 def device_mesh(num_devices: int | None = None) -> Mesh:
-    """A 1-D mesh named ``data`` over the first ``num_devices`` devices (default: all)."""
-    devices = jax.devices()[:num_devices]
+    """A 1-D mesh named ``data`` over the first ``num_devices`` devices of this process (default: all)."""
+    devices = jax.local_devices()[:num_devices]
     return Mesh(np.asarray(devices), (AXIS,))
+
+
+def mesh_of_all() -> Mesh:
+    """A 1-D mesh named ``data`` over the devices of all processes that work together."""
+    return device_mesh() if processes.count() == 1 else Mesh(np.asarray(jax.devices()), (AXIS,))
+
+
+def devices_for(part_size: int) -> int:
+    """How many devices of each process share parts of a batch of ``part_size`` trajectories evenly.
+
+    Raises:
+      UsageError: if the processes themselves do not divide it.
+    """
+    own, rest = divmod(part_size, processes.count())
+    if rest:
+        raise UsageError(
+            f"--part-size {part_size} does not divide over {processes.count()} processes; give a multiple, "
+            "and a --batch-size that is a multiple of it"
+        )
+    return largest_divisor(own, jax.local_device_count())
 
 
 def spread(mesh: Mesh) -> NamedSharding:
@@ -30,12 +62,27 @@ def spread(mesh: Mesh) -> NamedSharding:
 
 def split(mesh: Mesh, tree: Any) -> Any:
     """Put arrays on the mesh, their leading axis divided among the devices."""
-    return jax.device_put(tree, spread(mesh))
+    return _put(spread(mesh), tree)
 
 
 def replicate(mesh: Mesh, tree: Any) -> Any:
     """Put a copy of every array on each device."""
-    return jax.device_put(tree, NamedSharding(mesh, PartitionSpec()))
+    return _put(NamedSharding(mesh, PartitionSpec()), tree)
+
+
+def _put(layout: NamedSharding, tree: Any) -> Any:
+    """Put arrays on a mesh; where it belongs to several processes, each puts what is its own."""
+    if not layout.mesh.is_multi_process:
+        return jax.device_put(tree, layout)
+
+    def one(leaf: Any) -> Any:
+        if is_key(leaf):
+            wrapped = jax.jit(jax.random.wrap_key_data, out_shardings=layout)
+            return wrapped(one(jax.random.key_data(leaf)))
+        rows = np.asarray(leaf)
+        return jax.make_array_from_callback(rows.shape, layout, lambda index: rows[index])
+
+    return jax.tree.map(one, tree)
 
 
 def on_devices(
@@ -63,12 +110,69 @@ def on_devices(
 
 
 def fetch(tree: Any) -> Any:
-    """Arrays of devices as numpy arrays; random keys become their raw data."""
+    """Arrays of devices as numpy arrays; random keys become their raw data.
+
+    Arrays that are spread over several processes are gathered in all of them, so each must call this.
+    """
 
     def raw(leaf: Any) -> Any:
         return jax.random.key_data(leaf) if is_key(leaf) else leaf
 
-    return jax.device_get(jax.tree.map(raw, tree))
+    tree = jax.tree.map(raw, tree)
+    if all(getattr(leaf, "is_fully_addressable", True) for leaf in jax.tree.leaves(tree)):
+        return jax.device_get(tree)
+    return _gathered(tree)
+
+
+def _gathered(tree: Any) -> Any:
+    """The same for arrays of several processes, which travel as one vector of bytes."""
+    leaves, shape = jax.tree.flatten(tree)
+    own = [_own_rows(leaf) for leaf in leaves]
+    vector = np.concatenate([np.frombuffer(rows.tobytes(), np.uint8) for rows in own])
+    found = np.asarray(rows_of_processes(jnp.asarray(vector)))
+    ends = np.cumsum([0, *(rows.nbytes for rows in own)])
+    whole = []
+    for leaf, rows, first, last in zip(leaves, own, ends, ends[1:], strict=False):
+        pieces = [
+            np.frombuffer(of_process[first:last].tobytes(), rows.dtype).reshape(rows.shape)
+            for of_process in found
+        ]
+        copied = leaf.is_fully_replicated or leaf.is_fully_addressable
+        whole.append(pieces[processes.index()] if copied else np.concatenate(pieces))
+    return jax.tree.unflatten(shape, whole)
+
+
+def _own_rows(leaf: Array) -> np.ndarray:
+    """The rows of an array on the devices of this process, in their order."""
+    shards = leaf.addressable_shards
+    if leaf.is_fully_replicated:
+        return np.asarray(shards[0].data)
+    rows = sorted(shards, key=lambda shard: shard.index[0].start or 0)
+    return np.concatenate([np.asarray(shard.data) for shard in rows])
+
+
+def rows_of_processes(row: Array) -> Array:
+    """The vectors of all processes as rows, on the first device of each; each must call this."""
+    heads = _heads()
+    check_collective(heads)
+    own = jax.device_put(row, jax.local_devices()[0])[None]
+    shape = (heads.devices.size, *row.shape)
+    rows = jax.make_array_from_single_device_arrays(shape, spread(heads), [own])
+    return _gathering(heads)(rows).addressable_data(0)
+
+
+@cache
+def _heads() -> Mesh:
+    """One device of each process, so that no collective is between devices of one."""
+    first: dict[int, Any] = {}
+    for device in jax.devices():
+        first.setdefault(device.process_index, device)
+    return Mesh(np.asarray([first[number] for number in sorted(first)]), (AXIS,))
+
+
+@cache
+def _gathering(heads: Mesh) -> Any:
+    return jax.jit(lambda rows: rows, out_shardings=NamedSharding(heads, PartitionSpec()))
 
 
 def is_key(leaf: Any) -> bool:
@@ -86,6 +190,96 @@ def gather_rows(mesh: Mesh, tree: Any) -> list[Any]:
         jax.tree.map(lambda leaf, i=i: jax.device_put(leaf.addressable_shards[i].data, home), tree)
         for i in range(mesh.devices.size)
     ]
+
+
+class Adding:
+    """Brings rows of arrays together, one from each device, to be added in their order.
+
+    This is the one place that chooses how sums of gradients travel. In one process on CPUs the rows are
+    brought to the first device by plain copies. Several processes on CPUs add their own rows up, and a
+    program of its own gathers one vector from each. On accelerators XLA adds the rows of all devices of all
+    processes, and there is one row left.
+
+    Args:
+      mesh: devices of this process; of the other processes, as many take part.
+    """
+
+    def __init__(self, mesh: Mesh) -> None:
+        on_cpu = mesh.devices.flat[0].platform == "cpu"
+        self._mesh, self._alone = mesh, processes.count() == 1
+        self._copies = self._alone and (on_cpu or mesh.devices.size == 1)
+        self._whole = None if on_cpu else _with_others(mesh)
+        self._split_up: Any = None
+
+    def __call__(self, tree: Any) -> list[Any]:
+        """The rows, or what is left of them, each on the first device of this process."""
+        if self._copies:
+            return gather_rows(self._mesh, tree)
+        if self._split_up is None:
+            self._split_up = _splitting(tree)
+        if self._whole is not None:
+            return self._split_up(sum_by_collective(self._mesh, self._whole, tree)[None])
+        return self._split_up(rows_of_processes(_added(gather_rows(self._mesh, tree))))
+
+
+def _splitting(tree: Any) -> Any:
+    """A jitted function that makes records like the rows of ``tree`` of the rows of a matrix."""
+    blank = jax.tree.map(lambda leaf: np.zeros((1, *leaf.shape[1:]), leaf.dtype), tree)
+    restore = ravel_pytree(blank)[1]
+    return jax.jit(lambda matrix: [restore(row) for row in matrix])
+
+
+@jax.jit
+def _added(rows: list[Any]) -> Float[Array, "N"]:
+    """Rows added in their order, as one vector."""
+    return ravel_pytree(jax.tree.map(lambda *of_devices: sum(of_devices), *rows))[0]
+
+
+def _with_others(mesh: Mesh) -> Mesh:
+    """The mesh, with as many devices of each other process that works along."""
+    if processes.count() == 1:
+        return mesh
+    found: list[Any] = []
+    for number in range(jax.process_count()):
+        own = [device for device in jax.devices() if device.process_index == number]
+        found += own[: mesh.devices.size]
+    return Mesh(np.asarray(found), (AXIS,))
+
+
+def sum_by_collective(mesh: Mesh, whole: Mesh, tree: Any) -> Float[Array, "N"]:
+    """The sum of the rows on all devices of ``whole``, as one vector on the first device of ``mesh``.
+
+    ``mesh`` has this process's own devices among them.
+    """
+    check_collective(whole)
+    vectors = _vectors(mesh)(tree)
+    rows = jax.make_array_from_single_device_arrays(
+        (whole.devices.size, vectors.shape[1]),
+        spread(whole),
+        [shard.data for shard in vectors.addressable_shards],
+    )
+    return _summing(whole)(rows).addressable_data(0)
+
+
+def check_collective(mesh: Mesh) -> None:
+    """Fail where a collective would be between CPU devices of one process, which may stop for good."""
+    owners = [device.process_index for device in mesh.devices.flat]
+    on_cpus = mesh.devices.flat[0].platform == "cpu"
+    assert not (on_cpus and len(set(owners)) < len(owners)), mesh
+
+
+@cache
+def _vectors(mesh: Mesh) -> Any:
+    """Rows of a tree on each device as one vector there."""
+    return on_devices(mesh, lambda own: ravel_pytree(own)[0][None], [True], True)
+
+
+@cache
+def _summing(whole: Mesh) -> Any:
+    def total(rows: Float[Array, "D N"]) -> Float[Array, "N"]:
+        return rows.sum(axis=0)
+
+    return jax.jit(total, out_shardings=NamedSharding(whole, PartitionSpec()))
 
 
 def largest_divisor(number: int, limit: int) -> int:

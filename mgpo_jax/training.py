@@ -23,6 +23,7 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from envs.base import EnvSpec, Trajectory
 from envs.errors import DataError, UsageError
+from mgpo_jax import processes
 from mgpo_jax.dataset import BatchPlan, Dataset, check_dataset, plan_batches
 from mgpo_jax.kinds import Learned, kind_of
 from mgpo_jax.policy import LoadedPolicy, check_fits
@@ -35,10 +36,10 @@ from mgpo_jax.settings import (
     check_settings,
 )
 from mgpo_jax.sharding import (
+    Adding,
     device_mesh,
+    devices_for,
     fetch,
-    gather_rows,
-    largest_divisor,
     on_devices,
     replicate,
     split,
@@ -51,7 +52,8 @@ from mgpo_jax.transformer import (
     network_config,
 )
 
-FINITE = "weights_finite"  # a flag among the metrics of a step, which is no figure
+# Among the metrics of a step, but no figures: a flag, and how many processes were asked to stop before it.
+FINITE, ASKED = "weights_finite", "asked_to_stop"
 HIT = 0.1  # per-dimension tolerance for counting a predicted action as correct
 # Root mean square of a typical AdamW update before the learning rate.
 ADAMW_RMS = 0.2
@@ -291,17 +293,31 @@ class _Accumulator:
         def pack(sums: Any) -> Any:
             return _flatten(sums[0])[None], sums[1]
 
+        self.bring_together = Adding(mesh)
         self.unpack = on_devices(mesh, unravel, [False], False)
         self.pack = on_devices(mesh, pack, [True], True)
         self.add = on_devices(mesh, add, [False, True, True, True], True, donate_argnums=1)
         self.zeros = jax.jit(zeros, out_shardings=spread(mesh))
 
-    def sums(self, weights: Array, parts: Iterator[tuple[Any, Trajectory]]) -> list[Any]:
-        """One ``(gradient vector, Stats)`` for each device, over ``(keys, part)`` pairs."""
+        def note(asked: Any) -> Float[Array, "D"]:
+            return jnp.zeros(mesh.devices.size).at[0].set(asked)
+
+        self.note = jax.jit(note, out_shardings=spread(mesh))
+
+    def sums(
+        self, weights: Array, parts: Iterator[tuple[Any, Trajectory]], asked: int
+    ) -> list[Any]:
+        """Rows of ``(gradient vector, Stats)`` to be added up, over ``(keys, part)`` pairs.
+
+        Where several processes train together, also whether this one is asked to stop.
+        """
         params, sums = self.unpack(replicate(self.mesh, weights)), self.zeros()
         for keys, part in parts:
             sums = self.add(params, sums, keys, split(self.mesh, part))
-        return gather_rows(self.mesh, self.pack(sums))
+        packed = self.pack(sums)
+        if processes.count() > 1:
+            packed = (*packed, self.note(bool(asked)))
+        return self.bring_together(packed)
 
 
 def _make_update(
@@ -311,7 +327,7 @@ def _make_update(
 
     @partial(jax.jit, donate_argnums=(0, 1))
     def update(params: Any, opt_state: Any, rows: list[Any]) -> tuple[Any, Any, dict[str, Array]]:
-        flat, stats = jax.tree.map(lambda *of_devices: sum(of_devices)[0], *rows)
+        flat, stats, *asked = jax.tree.map(lambda *of_devices: sum(of_devices)[0], *rows)
         grads, weights = flat / stats.divisor, _flatten(params)
         updates, opt_state = optimizer.update(grads, opt_state, weights)
         metrics = {
@@ -321,6 +337,8 @@ def _make_update(
         }
         weights = optax.apply_updates(weights, updates)
         metrics[FINITE] = jnp.isfinite(weights).all()
+        if asked:
+            metrics[ASKED] = asked[0]
         return unravel(weights), opt_state, metrics
 
     return update
@@ -333,7 +351,8 @@ class Trainer:
       config: how to train.
       network_config: the network.
       dataset: the trajectories to learn from.
-      mesh: the devices to divide the parts of a batch among.
+      mesh: the devices of this process to divide the parts of a batch among. Where several processes work
+        together, each computes its own share of every part, and all of them take the same step.
 
     Raises:
       UsageError: if the devices do not divide ``config.part_size``, a setting is out of its bounds, or
@@ -344,9 +363,10 @@ class Trainer:
         self, config: TrainConfig, network_config: NetworkConfig, dataset: Dataset, mesh: Mesh
     ) -> None:
         check_settings(config)
-        if config.part_size % mesh.devices.size:
+        num_devices = mesh.devices.size * processes.count()
+        if config.part_size % num_devices:
             raise UsageError(
-                f"part_size {config.part_size} does not divide over {mesh.devices.size} devices"
+                f"part_size {config.part_size} does not divide over {num_devices} devices"
             )
         if config.obs_noise and not np.issubdtype(dataset.obs.dtype, np.floating):
             raise UsageError(
@@ -379,7 +399,7 @@ class Trainer:
         @partial(jax.jit, static_argnums=2, out_shardings=spread(mesh))
         def part_keys(step: Any, index: Any, num: int) -> Key[Array, "B"]:
             key = jax.random.fold_in(jax.random.fold_in(key_steps, step), index)
-            return jax.random.split(key, num)
+            return jax.random.split(key, num)[_own_share(num)]
 
         @jax.jit
         def part_stats(params: Any, key: PRNGKeyArray, part: Trajectory) -> Stats:
@@ -398,14 +418,21 @@ class Trainer:
         return TrainState(params, compiled(self._optimizer.init)(self._flatten(params)), 0)
 
     def step(
-        self, state: TrainState, plans: list[BatchPlan]
+        self, state: TrainState, plans: list[BatchPlan], asked: int = 0
     ) -> tuple[TrainState, dict[str, Array]]:
-        """One gradient step on the parts of a batch, and its metrics."""
+        """One gradient step on the parts of a batch, and its metrics.
+
+        ``asked`` says whether this process is asked to stop. Where several work together, the metrics of
+        all of them say how many are (``ASKED``), so that they can stop after the same step.
+        """
         parts = (
-            (self._part_keys(state.step, index, len(plan.lengths)), self._dataset.gather(*plan))
+            (
+                self._part_keys(state.step, index, len(plan.lengths)),
+                self._dataset.gather(*_own_part(plan)),
+            )
             for index, plan in enumerate(plans)
         )
-        rows = self._accumulator.sums(self._flatten(state.params), parts)
+        rows = self._accumulator.sums(self._flatten(state.params), parts, asked)
         params, opt_state, metrics = self._update(state.params, state.opt_state, rows)
         return TrainState(params, opt_state, state.step + 1), metrics
 
@@ -422,6 +449,18 @@ class Trainer:
         return total.means
 
 
+def _own_share(num: int) -> slice:
+    """Which of ``num`` trajectories of a part this process computes."""
+    own = num // processes.count()
+    return slice(processes.index() * own, (processes.index() + 1) * own)
+
+
+def _own_part(plan: BatchPlan) -> BatchPlan:
+    """What this process computes of a part of a batch."""
+    own = _own_share(len(plan.lengths))
+    return BatchPlan(plan.indices[own], plan.lengths[own], plan.num_steps)
+
+
 def finite_metrics(step: int, metrics: Mapping[str, Any]) -> dict[str, Any]:
     """The figures of a gradient step, numpy scalars.
 
@@ -430,6 +469,7 @@ def finite_metrics(step: int, metrics: Mapping[str, Any]) -> dict[str, Any]:
     """
     figures = {name: np.asarray(value) for name, value in fetch(dict(metrics)).items()}
     weights_finite = bool(figures.pop(FINITE, True))
+    figures.pop(ASKED, None)
     for name, value in figures.items():
         if not np.isfinite(value):
             raise diverged(step, f"train/{name}", value)
@@ -449,7 +489,7 @@ def diverged(step: int, metric: str, value: Any) -> DataError:
 def batch_stream(
     config: TrainConfig, dataset: Dataset, truncate: bool, num_devices: int = 1, first_step: int = 0
 ) -> Iterator[list[BatchPlan]]:
-    """The batches of a run from ``first_step`` on."""
+    """The batches of a run from ``first_step`` on; ``num_devices`` of all processes divide each part."""
     return plan_batches(
         dataset,
         seed=config.seed,
@@ -516,10 +556,12 @@ def pretrain(
     else:
         check_fits(init.config, spec, "the policy given as init")
         sizes = continued_network(init.config, network, "the policy given as init")
-    mesh = device_mesh(largest_divisor(config.part_size, len(jax.devices())))
+    mesh = device_mesh(devices_for(config.part_size))
     trainer = Trainer(config, sizes, dataset, mesh)
     state = trainer.init(None if init is None else init.params)
-    batches = batch_stream(config, dataset, spec.truncate_in_hindsight, mesh.devices.size)
+    batches = batch_stream(
+        config, dataset, spec.truncate_in_hindsight, mesh.devices.size * processes.count()
+    )
     before: dict[str, Any] = {}
     with Progress(config.steps, "step") as progress:
         while state.step < config.steps:
