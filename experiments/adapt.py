@@ -11,9 +11,10 @@ from typing import NoReturn
 
 import envs
 from envs.errors import UsageError
+from experiments.joining import check_flags, join
 from experiments.runtime import refuse_existing, run, say
 from experiments.store.settings import AdaptConfig
-from mgpo_jax import methods
+from mgpo_jax import methods, processes
 from mgpo_jax.methods import METHODS, foreign_setting
 from mgpo_jax.settings import flag
 
@@ -40,6 +41,7 @@ def adapt_default(config: AdaptConfig, flags: Iterable[str] = ()) -> AdaptConfig
 
 def main(config: AdaptConfig) -> None:
     """Adapt to each task within a budget of episodes, and judge what was found."""
+    check_flags(config)
     if config.validation and config.tasks is not None:
         raise UsageError("--validation draws the tasks; leave out --tasks")
     if config.validation_seed and not config.validation:
@@ -52,6 +54,7 @@ def main(config: AdaptConfig) -> None:
     if config.sweep or not (config.resume and os.path.isdir(folder)):
         refuse_existing(folder, "remove it", "choose another with --out")
     world = envs.find(config.env)
+    join(config)
     from envs.wrappers import behind_noise
     from experiments.adaptation import adapt_and_save, chosen_tasks, finished
     from experiments.store.summary import printed
@@ -66,14 +69,19 @@ def main(config: AdaptConfig) -> None:
         say(of_adaptation(config, world, env, policy, tasks))
         return
     if config.sweep:
-        show(config, sweep_and_save(config, world, env, policy, tasks))
+        folders = sweep_and_save(config, world, env, policy, tasks)
+        if processes.is_first():
+            show(config, folders)
         print(f"results in {folder}", file=sys.stderr)
         return
-    if folder.is_dir():
+    results = None
+    if not processes.from_first(folder.is_dir):
+        results = adapt_and_save(folder, config, world, env, policy, tasks)
+    elif processes.is_first():
         results = finished(folder, config, policy, tasks)
         print(f"{folder} is finished already", file=sys.stderr)
-    else:
-        results = adapt_and_save(folder, config, world, env, policy, tasks)
+    if results is None:  # process 0 has them
+        return
     say(json.dumps(results.summary, indent=2) if config.json else printed(results.summary))
     if config.figures:
         from experiments.drawing import draw_run

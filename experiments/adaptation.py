@@ -13,6 +13,7 @@ import numpy as np
 from envs.base import Environment, Task
 from envs.errors import UsageError
 from envs.registry import World
+from experiments.joining import OF_PROCESSES
 from experiments.runtime import expect_compiling
 from experiments.store.layout import META
 from experiments.store.policies import check_weights
@@ -22,7 +23,7 @@ from experiments.store.runs import changes
 from experiments.store.settings import AdaptConfig
 from experiments.store.summary import ADAPT_AGAIN, judged_episodes, summarize
 from experiments.store.work import PIECES, long_work
-from mgpo_jax import methods
+from mgpo_jax import methods, processes
 from mgpo_jax.files import hash_arrays, new_folder, remove_leftovers, to_json
 from mgpo_jax.journal import Journal
 from mgpo_jax.policy import LoadedPolicy
@@ -54,6 +55,9 @@ def adapt_all(
     What is finished is kept in ``journal``.
     """
     first = configs[0]
+    processes.check_agreed(
+        {name: value for name, value in deciding(first, policy, tasks).items() if "sha256" in name}
+    )
     num_judged = judged_episodes(to_json(first), world)
     assert num_judged is not None
     judged = dataclasses.replace(world.judged, episodes=num_judged)
@@ -76,6 +80,7 @@ def adapt_all(
 
 NOT_DECIDING = (
     "config", "debug", "dry_run", "figures", "json", "out", "policy", "quiet", "resume", "sweep", "tasks",
+    *OF_PROCESSES,
 )  # fmt: skip
 """Settings of the command that do not decide about its results, or whose content is hashed instead."""
 ADDED = ("obs_noise", "action_noise", "stop_at")
@@ -119,8 +124,10 @@ def adapt_and_save(
     env: Environment,
     policy: LoadedPolicy,
     tasks: Task,
-) -> Results:
+) -> Results | None:
     """Adapt to all tasks as an ``AdaptConfig`` says, and write the results to a new folder.
+
+    Of several processes that adapt together, process 0 has the results.
 
     Raises:
       UsageError: if there is unfinished work that ``--resume`` does not ask for or that has other settings.
@@ -130,6 +137,8 @@ def adapt_and_save(
     with long_work(folder, settings, provenance(), config.resume) as work:
         expect_compiling()
         (outcome,) = adapt_all(world, env, policy, tasks, [config], work.journal)
+        if not processes.is_first():
+            return None
         results = results_with_summary(config, env, policy, tasks, outcome)
         write_results(work.place, results, folder, work.meta)
     return results

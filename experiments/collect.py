@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NoReturn
 
+from experiments.joining import join
 from experiments.runtime import run
 from experiments.store.settings import CollectConfig
 
 
 def main(config: CollectConfig) -> None:
     """Collect demonstrations on random tasks, none of them a test task."""
+    join(config)
     from experiments.datasets import collect_and_save
 
     collect_and_save(config)

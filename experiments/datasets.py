@@ -28,6 +28,7 @@ from experiments.runtime import expect_compiling, refuse_existing
 from experiments.store.provenance import provenance, versions
 from experiments.store.settings import CollectConfig, PretrainConfig, dataset_folder
 from experiments.store.work import PIECES, long_work
+from mgpo_jax import processes
 from mgpo_jax.claims import check_place
 from mgpo_jax.dataset import Dataset, hash_task, load_dataset, spec_of, write_dataset
 from mgpo_jax.files import ExistsError, remove_leftovers
@@ -185,7 +186,11 @@ def _rows(found: Demonstration, hashes: np.ndarray, rows: np.ndarray) -> dict[st
 def _record(
     found: Demonstration, indices: np.ndarray, forbidden: np.ndarray, room: int
 ) -> dict[str, np.ndarray]:
-    """What is kept of a batch of demonstrations: ``room`` of them at most, and what became of the rest."""
+    """What is kept of a batch of demonstrations: ``room`` of them at most, and what became of the rest.
+
+    There are as many demonstrations as indices, and after them any number that only fill up a program.
+    """
+    found = jax.tree.map(lambda rows: rows[: len(indices)], found)
     hashes = np.array([hash_task(one) for one in found.fingerprint], np.uint64)
     unseen = ~np.isin(hashes, forbidden)
     return {
@@ -194,6 +199,54 @@ def _record(
         "num_failed": np.sum(found.episode.failed),
         "num_test": np.sum(~unseen),
     }
+
+
+OF_TRAJECTORIES = ("lengths", "task_hashes", "last_obs", "variants", "returns")
+"""Arrays of a record with an entry for each demonstration; most others have one for each step."""
+COUNTED = ("again", "num_failed", "num_test")
+"""What a record says of the demonstrations that are not kept."""
+
+
+def _of_all(own: dict[str, np.ndarray], room: int) -> dict[str, np.ndarray]:
+    """The records of all processes as one; the others than process 0 only need what it counts."""
+    if processes.count() == 1:
+        return own
+    whole: dict[str, np.ndarray] = {}
+
+    def combine(pieces: list[bytes]) -> bytes:
+        whole.update(_as_one([processes.from_bytes(piece) for piece in pieces], room))
+        return processes.to_bytes({name: whole[name] for name in ("lengths", *COUNTED)})
+
+    told = processes.combined(processes.to_bytes(own), combine)
+    return whole or processes.from_bytes(told)
+
+
+def _as_one(records: Sequence[dict[str, np.ndarray]], room: int) -> dict[str, np.ndarray]:
+    """The record of a batch from those of its parts in order; at most ``room`` demonstrations are kept."""
+    joined = {
+        name: np.concatenate([np.atleast_1d(record[name]) for record in records])
+        for name in records[0]
+    }
+    lengths = joined["lengths"][:room]
+    for name, rows in joined.items():
+        if name not in COUNTED:
+            joined[name] = rows[: len(lengths) if name in OF_TRAJECTORIES else lengths.sum()]
+    return {
+        **joined,
+        "num_failed": joined["num_failed"].sum(),
+        "num_test": joined["num_test"].sum(),
+    }
+
+
+def _own_lanes() -> tuple[np.ndarray, int]:
+    """Which episodes of a batch this process runs, and how many of them count.
+
+    All processes run as many; the last ones of the last process fill up its program.
+    """
+    each = -(-BATCH // processes.count())
+    first = processes.index() * each
+    lanes = np.arange(first, first + each)
+    return lanes % BATCH, int(np.sum(lanes < BATCH))
 
 
 def _batches(
@@ -205,7 +258,11 @@ def _batches(
     attempts: _Attempts,
     journal: Journal,
 ) -> Iterator[dict[str, np.ndarray]]:
-    """Records of batches of attempts, until they hold ``num`` demonstrations to keep."""
+    """Records of batches of attempts, until they hold ``num`` demonstrations to keep.
+
+    Several processes divide each batch among them, so that attempts and results stay what they are.
+    """
+    lanes, num_own = _own_lanes()
     demonstrate = program_of(env, demonstrator)
     num_kept = fruitless = 0
     for batch in count():
@@ -213,8 +270,9 @@ def _batches(
         record = journal.read(name)
         if record is None:
             keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), batch), BATCH)
-            found = fetch(demonstrate(keys, indices, demonstrator.weights))
-            record = _record(found, indices, forbidden, num - num_kept)
+            own, room = indices[lanes], num - num_kept
+            found = fetch(demonstrate(keys[lanes], own, demonstrator.weights))
+            record = _of_all(_record(found, own[:num_own], forbidden, room), room)
             journal.write(name, record)
         attempts.failed(record.pop("again"))
         num_new = len(record["lengths"])
@@ -231,14 +289,32 @@ def _batches(
 
 
 def collect(
+    env: Environment, demonstrator: Demonstrator, num: int, seed: int, num_test_tasks: int
+) -> tuple[Dataset, dict[str, Any]]:
+    """Demonstrations, none of them of a test task, and facts about them, as ``collected``.
+
+    Several processes that collect together all have them in the end.
+    """
+    found = collected(env, demonstrator, num, seed, num_test_tasks)
+    if processes.count() == 1:
+        assert found is not None
+        return found
+    arrays = processes.arrays_from_first(lambda: found and found[0].arrays)
+    facts = processes.from_first(lambda: found and found[1])
+    assert arrays is not None
+    assert facts is not None
+    return Dataset(**arrays), facts
+
+
+def collected(
     env: Environment,
     demonstrator: Demonstrator,
     num: int,
     seed: int,
     num_test_tasks: int,
     journal: Journal | None = None,
-) -> tuple[Dataset, dict[str, Any]]:
-    """Demonstrations, none of them of a test task, and facts about them.
+) -> tuple[Dataset, dict[str, Any]] | None:
+    """Demonstrations, none of them of a test task, and facts about them; None if process 0 has them.
 
     Those that are not worth keeping are tried again with another key, so that a demonstrator that goes
     through all tasks in turn demonstrates each of them equally often, but for the last batch.
@@ -265,6 +341,8 @@ def collect(
             num_test += int(record.pop("num_test"))
             kept.append(record)
             progress.update(len(record["lengths"]))
+    if not processes.is_first():
+        return None
     arrays = {name: np.concatenate([part[name] for part in kept]) for name in kept[0]}
     returns = arrays.pop("returns")
     names = demonstrator.variants
@@ -319,22 +397,28 @@ def collect_and_save(
         "seed": config.seed,
     }
     asked = {**made, "trajectories": config.trajectories}
-    if config.resume and os.path.isdir(folder):
-        remove_leftovers(folder, PIECES)
-        load_dataset(folder, env.spec, {**made, "num_trajectories": config.trajectories})
-        print(f"{folder} is finished already", file=sys.stderr)
+    if processes.from_first(lambda: config.resume and os.path.isdir(folder)):
+        if processes.is_first():
+            remove_leftovers(folder, PIECES)
+            load_dataset(folder, env.spec, {**made, "num_trajectories": config.trajectories})
+            print(f"{folder} is finished already", file=sys.stderr)
         return
-    if not wait:
+    if processes.is_first() and not wait:
         refuse_existing(folder, "remove it", "choose another with --out")
-    check_place(folder, num_bytes=config.trajectories * SMALLEST_TRAJECTORY)
+    if processes.is_first():
+        check_place(folder, num_bytes=config.trajectories * SMALLEST_TRAJECTORY)
     with long_work(folder, asked, provenance(), config.resume, wait, go_on) as work:
         expect_compiling()
         cpu = time.process_time()
-        dataset, facts = collect(
+        found = collected(
             env, demonstrator, config.trajectories, config.seed, world.num_test_tasks, work.journal
         )
-        cpu = time.process_time() - cpu
-        write_dataset(work.place, dataset, {**made, "versions": versions(), **facts})
+        cpu = processes.total(time.process_time() - cpu)
+        if found is not None:
+            write_dataset(work.place, found[0], {**made, "versions": versions(), **found[1]})
+    if found is None:
+        return
+    dataset, facts = found
     length, return_ = facts["length"]["mean"], facts["hindsight_return"]["mean"]
     print(
         f"{folder}: {len(dataset)} trajectories, {dataset.lengths.sum()} steps\n"
@@ -398,12 +482,15 @@ def prepare_dataset(
         seed=config.data.data_seed,
     )
     folder = dataset_folder(wanted, name)
-    remove_leftovers(folder, PIECES)
-    if not folder.exists():
+    if processes.is_first():
+        remove_leftovers(folder, PIECES)
+    if not processes.from_first(folder.exists):
         text = f"no dataset in {folder} yet: {wanted.trajectories} trajectories are collected first"
         print(text, file=sys.stderr)
-        with suppress(ExistsError):  # another process has collected it meanwhile
+        # Another command may have collected it meanwhile, which processes that collect together do not see.
+        with suppress(*[ExistsError] * (processes.count() == 1)):
             collect_and_save(replace(wanted, resume=True), True, go_on)
+        processes.exchange(b"")  # from here on it is there for all
     made = {
         "env": config.env,
         "policy": name,

@@ -10,13 +10,15 @@ from typing import Any, Literal, NoReturn
 
 import tyro
 
-from experiments.runtime import Common, refuse_existing_file, require_runs, run, say
+from experiments.joining import Joined, check_flags, join
+from experiments.runtime import refuse_existing_file, require_runs, run, say
 from experiments.signals import farewell
+from mgpo_jax import processes
 from mgpo_jax.settings import Name, NotNegative, NumEpisodes, Seed
 
 
 @dataclass(frozen=True)
-class EvaluateConfig(Common):
+class EvaluateConfig(Joined):
     """Settings of ``experiments.evaluate``."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]] = ()
@@ -40,9 +42,11 @@ class EvaluateConfig(Common):
 
 def main(config: EvaluateConfig) -> None:
     """Evaluate the optimized prompts of adaptations once more, under noise (Table 3) or elsewhere."""
+    check_flags(config)
     require_runs(config.runs, "evaluate")
     if config.json:
         refuse_existing_file(config.json, "--json")
+    join(config)
     from experiments.evaluation import (
         HEAD,
         achieved_table,
@@ -62,7 +66,7 @@ def main(config: EvaluateConfig) -> None:
     def unfinished() -> str:
         if rows:
             say(table(HEAD, [cells(row) for row in rows]))
-            if config.json:
+            if config.json and processes.is_first():
                 write_json(config.json, {"rows": rows, **provenance()})
         return f"stopped after {len(rows)} rows; run it again with the runs or noises that are left"
 
@@ -75,7 +79,7 @@ def main(config: EvaluateConfig) -> None:
     if num_failed := sum(row["failed_episodes"] for row in rows):
         total = sum(row["num_episodes"] for row in rows)
         say(f"{num_failed} of {total} episodes ended because the world broke down")
-    if config.json:
+    if config.json and processes.is_first():
         write_json(config.json, {"rows": rows, **provenance()})
         print(f"rows in {config.json}", file=sys.stderr)
 

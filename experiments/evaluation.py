@@ -20,6 +20,8 @@ from experiments.store.policies import load_policy_of
 from experiments.store.results import Results, load_results
 from experiments.store.statistics import SeedSpread, mean_log_success, seed_spread
 from experiments.store.tables import table
+from mgpo_jax import processes
+from mgpo_jax.files import hash_arrays
 from mgpo_jax.optimizers.methods import judged_query
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.progress import Progress
@@ -102,6 +104,12 @@ def open_case(
         flag = "--action-noise" if any(noise.action for noise in sizes) else "--obs-noise"
         raise UsageError(f"{flag}: {error}; give another size") from None
     loaded = load_policy_of(result, world, policy)
+    processes.check_agreed(
+        {
+            f"the hash of the results in {folder}": hash_arrays({**result.best, **result.tasks}),
+            f"the hash of the policy of {folder}": loaded.sha256,
+        }
+    )
     return Case(folder, result, name, world, behind, tasks, loaded)
 
 

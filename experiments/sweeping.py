@@ -19,7 +19,7 @@ from experiments.store.provenance import provenance
 from experiments.store.results import write_results
 from experiments.store.settings import AdaptConfig
 from experiments.store.work import long_work
-from mgpo_jax import methods
+from mgpo_jax import methods, processes
 from mgpo_jax.methods import foreign_setting, split_hyper
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.settings import check_settings, check_values, get_parts, types_of
@@ -108,6 +108,8 @@ def sweep_and_save(
     with long_work(config.folder, settings, provenance(), config.resume) as work:
         expect_compiling()
         outcomes = adapt_all(world, env, policy, tasks, list(named.values()), work.journal)
+        if not processes.is_first():
+            outcomes, named = [], {}
         for (name, variant), outcome in zip(named.items(), outcomes, strict=True):
             place = work.place / name
             place.mkdir()

@@ -1,4 +1,7 @@
-"""Finished pieces of a long work on disk, so that a process that was killed can go on where it was."""
+"""Finished pieces of a long work on disk, so that a process that was killed can go on where it was.
+
+Where several processes work together, process 0 has the records and tells the others what it reads.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mgpo_jax import processes
 from mgpo_jax.files import hash_arrays, remove_unfinished, write_arrays
 
 _HASH = "sha256"
@@ -17,7 +21,7 @@ class Journal:
     """Records of arrays by name; each is on disk when ``write`` returns, whole or not at all.
 
     Args:
-      folder: where the records are; None keeps nothing.
+      folder: where the records are, in process 0; None keeps nothing.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
@@ -25,9 +29,14 @@ class Journal:
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
             remove_unfinished(folder)
+        self.keeps = processes.from_first(lambda: folder is not None)
+        """Whether records are kept; the same in all processes, each of which must make a journal."""
 
     def read(self, name: str) -> dict[str, np.ndarray] | None:
         """The record of that name, or None if there is none that is sound."""
+        return processes.arrays_from_first(lambda: self._read(name)) if self.keeps else None
+
+    def _read(self, name: str) -> dict[str, np.ndarray] | None:
         path = None if self.folder is None else self.folder / f"{name}.npz"
         if path is None or not path.is_file():
             return None

@@ -1,9 +1,9 @@
 """Runs many episodes and adaptations at once. Everything that commands and examples run goes through here.
 
 Every task, seed and variant of a method is a *lane* of one compiled program. Lanes are spread over the
-devices and, on each, run in *groups*: the lanes of a group share one clock, so that a group's episode ends
-with its slowest lane. On a CPU a group is as large as the memories of its agents fit into the cache near a
-core, or as large as a step of the world needs to be worth its call.
+devices of all processes that work together and, on each, run in *groups*: the lanes of a group share one
+clock, so that a group's episode ends with its slowest lane. On a CPU a group is as large as the memories of
+its agents fit into the cache near a core, or as large as a step of the world needs to be worth its call.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from envs.base import Environment, Episode, Goals, Task
 from envs.errors import DataError, NotAvailableError, UsageError
 from envs.registry import Judgement, World
 from envs.registry import find as find_world
+from mgpo_jax import processes
 from mgpo_jax.adaptation import (
     Adapter,
     AdaptLog,
@@ -40,7 +41,7 @@ from mgpo_jax.methods import Method, Setting, find, split_hyper, with_numbers
 from mgpo_jax.policy import LoadedPolicy, check_fits, transformer_policy
 from mgpo_jax.progress import Progress
 from mgpo_jax.rollout import Query, rollout
-from mgpo_jax.sharding import device_mesh, fetch, is_key, on_devices, replicate, split
+from mgpo_jax.sharding import fetch, is_key, mesh_of_all, on_devices, replicate, split
 from mgpo_jax.stopping import ended, filled
 from mgpo_jax.tasks import num_tasks
 from mgpo_jax.transformer import GoalTransformer, TransformerConfig
@@ -361,7 +362,7 @@ def lanes_together(env: Environment, memory_bytes: int) -> int:
 
 def _lay_out(env: Environment, num_lanes: int, memory_bytes: int) -> Layout:
     """Spread at least ``num_lanes`` lanes evenly."""
-    mesh = device_mesh()
+    mesh = mesh_of_all()
     on_each = -(-num_lanes // mesh.devices.size)
     num_groups = -(-on_each // lanes_together(env, memory_bytes))
     group = -(-on_each // num_groups)
@@ -525,7 +526,7 @@ def _run(run: Run, journal: Journal) -> tuple[Record, float]:
     programs, lanes, params, segments, grid, layout, per_round, stop_at = run
     state = programs.start.compile(lanes, params)(lanes, params)
     # A method whose first state holds NaN means something by it.
-    watched = bool(_learns(state.search)) and not fetch(_broken(state.search)).any()
+    watched = bool(_learns(state.search)) and not _broken(state.search, layout.mesh).any()
     shared = (params, jnp.int32(0), jnp.int32(0))
     advance = programs.advance.compile((state, lanes), shared)
     done: list[Segment] = []
@@ -545,14 +546,14 @@ def _run(run: Run, journal: Journal) -> tuple[Record, float]:
             shared = (params, jnp.int32(num), jnp.int32(number))
             state, log, judged = advance((state, lanes), shared)
             log, judged = fetch((log, judged))
-            cpu = time.process_time() - cpu
+            cpu = processes.total(time.process_time() - cpu)
             log = jax.tree.map(lambda rows, n=num: rows[: grid.size, :n], log)
             judged = jax.tree.map(lambda rows: rows[: grid.size], judged)
             if stopped.any():
                 log, judged = filled(log, judged, stopped, [(s.log, s.judged) for s in done])
             _check_finite(log, judged, grid, before)
             if watched:
-                _check_sound(state.search, grid, before + num)
+                _check_sound(state.search, run, before + num)
             done.append(Segment(log, judged, cpu))
             _keep(journal, number, done[-1], state, grid)
             progress.update(num * per_round)
@@ -589,16 +590,24 @@ def _learns(searches: Any) -> list[Array]:
     return [leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)]
 
 
-@jax.jit
-def _broken(searches: Any) -> Bool[Array, "lanes"]:
-    """Which searches hold NaN in their states."""
-    found = [jnp.isnan(leaf).reshape(len(leaf), -1).any(axis=1) for leaf in _learns(searches)]
-    return jnp.any(jnp.stack(found), axis=0)
+def _broken(searches: Any, mesh: Mesh) -> np.ndarray:
+    """Which searches [lanes] hold NaN in their states."""
+    return fetch(_breaking(mesh)(_learns(searches)))
 
 
-def _check_sound(searches: Any, grid: Grid, rounds: int) -> None:
+@cache
+def _breaking(mesh: Mesh) -> Any:
+    def broken(leaves: list[Array]) -> Bool[Array, "lanes"]:
+        found = [jnp.isnan(leaf).reshape(len(leaf), -1).any(axis=1) for leaf in leaves]
+        return jnp.any(jnp.stack(found), axis=0)
+
+    return on_devices(mesh, broken, [True], True)
+
+
+def _check_sound(searches: Any, run: Run, rounds: int) -> None:
     """Raise ``DataError`` for the first search whose state holds NaN, such as weights that diverged."""
-    if (broken := fetch(_broken(searches))[: grid.size]).any():
+    grid = run.grid
+    if (broken := _broken(searches, run.layout.mesh)[: grid.size]).any():
         seed, task = divmod(int(np.argmax(broken)) % (grid.seeds * grid.tasks), grid.tasks)
         raise DataError(
             f"the search on task {task} with seed number {seed} has diverged: what it learned holds NaN "
@@ -608,7 +617,7 @@ def _check_sound(searches: Any, grid: Grid, rounds: int) -> None:
 
 def _keep(journal: Journal, number: int, segment: Segment, state: Any, grid: Grid) -> None:
     """Write a finished segment to the journal, and then the state that the next one starts from."""
-    if journal.folder is None:
+    if not journal.keeps:
         return
     journal.write(f"segment{number:04}", numbered_leaves(segment))
     own = jax.tree.map(lambda rows: rows[: grid.size], fetch(state))

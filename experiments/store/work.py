@@ -17,6 +17,7 @@ from pydantic import BaseModel
 from envs.errors import UsageError
 from experiments.signals import farewell
 from experiments.store.runs import changes, say_what_differs
+from mgpo_jax import processes
 from mgpo_jax.files import has_work, new_folder, partial_name, to_json, write_json
 from mgpo_jax.journal import Journal
 from mgpo_jax.schema import STRICT, Json, read_document
@@ -59,6 +60,8 @@ def long_work(
 ) -> Iterator[Work]:
     """A place to write the result to, and a journal of finished pieces.
 
+    Of several processes that work together only process 0 has the place, where it writes the result.
+
     Args:
       folder: what the place becomes when the block ends.
       settings: everything that decides about the result.
@@ -71,6 +74,9 @@ def long_work(
       DataError: if ``folder`` exists, or another process makes it.
       UsageError: if there is unfinished work that ``resume`` does not ask for, or it is of other settings.
     """
+    if not processes.is_first():
+        yield Work(Path(), Journal(), {})
+        return
     pieces = partial_name(folder) / PIECES
     with new_folder(folder, keep=PIECES, wait=wait) as place:
         if has_work(pieces) and not resume:
