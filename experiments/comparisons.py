@@ -7,6 +7,7 @@ under ``results/`` is taken from there if it is of the same weights, tasks and s
 
 from __future__ import annotations
 
+import itertools
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -33,7 +34,7 @@ from experiments.store.statistics import SeedSpread
 from experiments.store.summary import read_summary
 from experiments.store.tables import number, table
 from experiments.training import train
-from mgpo_jax import methods
+from mgpo_jax import methods, processes
 from mgpo_jax.policy_files import load_policy
 from mgpo_jax.tasks import num_tasks, test_tasks
 
@@ -238,6 +239,27 @@ def cells(config: ReproduceConfig) -> Iterator[Cell]:
     for world in worlds_of(config):
         for method in methods_of(config):
             yield made(config, world, method)
+
+
+def share_out(config: ReproduceConfig) -> None:
+    """Make the cells of a comparison that are missing, each in one of the processes that work together.
+
+    They need a folder that all of them see. Cells that start from the same trained network are made by the
+    same process. One process by itself makes them when the table asks for them.
+    """
+    if processes.count() == 1:
+        return
+    groups: dict[Any, list[tuple[str, str]]] = {}
+    for world in worlds_of(config):
+        for method in methods_of(config):
+            trains = config.scale == "paper"
+            group = (world, methods.find(method).policy if trains else method)
+            groups.setdefault(group, []).append((world, method))
+    own = list(groups.values())[processes.index() :: processes.count()]
+    with processes.apart():
+        for world, method in itertools.chain.from_iterable(own):
+            made(config, world, method)
+    processes.exchange(b"")
 
 
 HEAD = (

@@ -19,6 +19,7 @@ from typing import NoReturn
 
 import envs
 from envs.errors import DataError, NotAvailableError, UsageError, nearest, printable
+from experiments.joining import join
 from experiments.runtime import run, say
 from experiments.store.settings import (
     ABLATIONS,
@@ -31,6 +32,7 @@ from experiments.store.settings import (
     ReproduceConfig,
     check_reproduction,
 )
+from mgpo_jax import processes
 from mgpo_jax.claims import check_place
 
 
@@ -75,10 +77,15 @@ def make(config: ReproduceConfig) -> None:
 
 def make_comparison(config: ReproduceConfig) -> None:
     """Make a table of several methods and worlds."""
+    join(config)
     from experiments import comparisons, robustness
 
+    comparisons.share_out(config)
+    if not processes.is_first():
+        return
     behind_noise = config.what == "table3"
-    say(robustness.compare(config) if behind_noise else comparisons.compare(config))
+    with processes.apart():  # process 0 has all cells now, and makes the table by itself
+        say(robustness.compare(config) if behind_noise else comparisons.compare(config))
     place = comparisons.files_of(config)[0]
     print(
         f"table in {place}" if behind_noise else f"table and curves in {place} and .png",
