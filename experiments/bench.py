@@ -2,6 +2,8 @@
 
 CPU time of the process, not wall time, so that a shared machine and the number of cores matter little;
 the machine's own matrix-product rate, measured in the same run between the rows, stands beside them.
+With ``--distributed`` the processes share the work, and their CPU time is added; ``--layouts`` starts such
+processes on this machine and shows what each way to divide it costs.
 """
 
 from __future__ import annotations
@@ -10,21 +12,24 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, Literal, NoReturn
 
 import tyro
 
 import envs
-from experiments.runtime import Common, refuse_existing_file, run, say
+from experiments.joining import Joined, check_flags, join
+from experiments.layouts import check_layouts, measured
+from experiments.runtime import refuse_existing_file, run, say
 from experiments.signals import farewell
 from experiments.store.settings import DEFAULT_WORLD
+from mgpo_jax import processes
 from mgpo_jax.settings import Name, NumTrajectories
 
 COLUMNS = (18, 10, 18, 0)  # widths of name, value, unit and note, which are printed one by one
 
 
 @dataclass(frozen=True)
-class BenchConfig(Common):
+class BenchConfig(Joined):
     """Settings of ``experiments.bench``."""
 
     env: Name = DEFAULT_WORLD
@@ -35,15 +40,27 @@ class BenchConfig(Common):
     """A tenth of the work: shows that it runs, gives rough numbers."""
     trajectories: Annotated[NumTrajectories | None, tyro.conf.arg(aliases=("--episodes",))] = None
     """Trajectories to collect (default: 5,000; quick: 500)."""
+    rows: Literal["all", "shared", "step"] = "all"
+    """Which rows: shared leaves out what processes do not share, step ends with the gradient step."""
+    layouts: tuple[str, ...] = ()
+    """Ways to divide this machine, such as ``1x2 2x1 1x8``: so many processes with so many devices each.
+    Shown are the rows that they share, or with ``--rows step`` those up to the gradient step."""
     json: Path | None = None
     """Also write the rows to this file."""
 
 
 def main(config: BenchConfig) -> None:
     """Measure the speed of collection, training and adaptation in CPU time."""
+    check_flags(config)
     envs.find(config.env)
+    if config.layouts:
+        check_layouts(config.layouts, config.distributed)
     if config.json is not None:
         refuse_existing_file(config.json, "--json")
+    if config.layouts:
+        show_layouts(config)
+        return
+    join(config)
     from experiments.datasets import find_demonstrator
     from experiments.measurements import measurements
     from experiments.store.provenance import provenance
@@ -55,13 +72,35 @@ def main(config: BenchConfig) -> None:
     rows = []
     num = config.trajectories or (500 if config.quick else 5_000)
     with farewell(lambda: "stopped; the figures so far stand, run it again for the others"):
-        for row in measurements(config.env, config.demonstrator, num, config.quick):
+        for row in measurements(config.env, config.demonstrator, num, config.quick, config.rows):
             rows.append(row)
             cells = (row.name, f"{row.value:>10.3f}", row.unit, row.note)
             say(aligned(cells, COLUMNS))
-    if config.json:
+    if config.json and processes.is_first():
         write_json(config.json, {"env": config.env, "rows": rows, **provenance()})
         print(f"rows in {config.json}", file=sys.stderr)
+
+
+def show_layouts(config: BenchConfig) -> None:
+    """The shared rows of the bench for each way to divide the machine."""
+    from experiments.store.tables import aligned
+    from mgpo_jax.files import write_json
+
+    rows_wanted = "step" if config.rows == "step" else "shared"
+    words = ["--env", config.env, "--rows", rows_wanted, *(["--quick"] if config.quick else [])]
+    if config.demonstrator is not None:
+        words += ["--demonstrator", config.demonstrator]
+    if config.trajectories is not None:
+        words += ["--trajectories", str(config.trajectories)]
+    found = []
+    for layout in config.layouts:
+        rows = measured(layout, words)
+        found.append({"layout": layout, "rows": rows})
+        for row in rows:
+            cells = (layout, row["name"], f"{row['value']:>10.3f}", row["unit"], row["note"])
+            say(aligned(cells, (6, *COLUMNS)))
+    if config.json:
+        write_json(config.json, {"env": config.env, "layouts": found})
 
 
 def command(argv: Sequence[str] | None = None) -> NoReturn:

@@ -24,7 +24,7 @@ from envs.wrappers import Wrapper
 from experiments.datasets import collect, find_demonstrator
 from experiments.store.settings import PretrainConfig, pretrain_preset
 from experiments.training import configured_network
-from mgpo_jax import methods
+from mgpo_jax import methods, processes
 from mgpo_jax.dataset import BatchPlan, Dataset
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.policy_files import load_policy
@@ -32,7 +32,7 @@ from mgpo_jax.prompts import Prompt, single_goal
 from mgpo_jax.rollout import Query, rollout
 from mgpo_jax.runner import adapt, cache_bytes, lanes_together, together
 from mgpo_jax.settings import TrainConfig
-from mgpo_jax.sharding import device_mesh, largest_divisor
+from mgpo_jax.sharding import device_mesh, devices_for
 from mgpo_jax.tasks import benchmark_tasks
 from mgpo_jax.training import Trainer, batch_stream
 from mgpo_jax.transformer import TransformerConfig
@@ -52,9 +52,21 @@ class Row:
 
 
 def measurements(
-    env_name: str, demonstrator: str | None, num_trajectories: int, quick: bool
+    env_name: str,
+    demonstrator: str | None,
+    num_trajectories: int,
+    quick: bool,
+    rows: str = "all",
 ) -> Iterator[Row]:
-    """All rows of the bench for a world; ``quick`` does a tenth of the work."""
+    """All rows of the bench for a world.
+
+    Args:
+      env_name: the world.
+      demonstrator: whose demonstrations are collected (default: those of the recipe).
+      num_trajectories: how many.
+      quick: whether to do a tenth of the work.
+      rows: ``all``, ``shared`` (what several processes share) or ``step`` (up to the gradient step).
+    """
     world, env = envs.find(env_name), envs.make(env_name)
     note = "2048 x 2048, float32"
     yield Row("matrix product", matrix_product_rate(), "GFLOP / CPU-s", note)
@@ -64,10 +76,14 @@ def measurements(
     yield row
     network = configured_network(recipe, env, dataset)
     yield from bench_gradient_step(recipe.train, network, env, dataset, 16 if quick else 64)
+    if rows == "step":
+        return
     policy, note = policy_to_bench(world, env, recipe, dataset)
-    yield from bench_acting(env, policy, note)
+    if rows == "all":
+        yield from bench_acting(env, policy, note)
     yield bench_adaptation(world, env, policy, note, 20 if quick else 100)
-    yield from bench_baselines(world, env, env_name, dataset, 20 if quick else 40)
+    if rows == "all":
+        yield from bench_baselines(world, env, env_name, dataset, 20 if quick else 40)
 
 
 def cpu_time(work: Callable[[], Any]) -> tuple[Any, float]:
@@ -75,6 +91,12 @@ def cpu_time(work: Callable[[], Any]) -> tuple[Any, float]:
     start = time.process_time()
     result = jax.block_until_ready(work())
     return result, time.process_time() - start
+
+
+def shared_cpu_time(work: Callable[[], Any]) -> tuple[Any, float]:
+    """The same for work that several processes share: the CPU-seconds of all of them."""
+    result, cpu = cpu_time(work)
+    return result, processes.total(cpu)
 
 
 def matrix_product_rate(size: int = 2048, repeats: int = 4) -> float:
@@ -113,7 +135,7 @@ def bench_collect(
     name, demonstrator = find_demonstrator(world, env, name)
     collecting = partial(collect, env, demonstrator, num_test_tasks=world.num_test_tasks)
     collecting(num=1, seed=1)  # compiles
-    (dataset, _), cpu = cpu_time(lambda: collecting(num=num, seed=0))
+    (dataset, _), cpu = shared_cpu_time(lambda: collecting(num=num, seed=0))
     note = f"{name}, {num} kept, task generation included"
     return dataset, Row("collection", num / cpu, "episodes / CPU-s", note)
 
@@ -126,9 +148,10 @@ def bench_gradient_step(
     num_steps: int,
 ) -> Iterator[Row]:
     """Gradient steps over the recipe's own stream of batches."""
-    mesh = device_mesh(largest_divisor(config.part_size, len(jax.devices())))
+    mesh = device_mesh(devices_for(config.part_size))
     trainer = Trainer(config, network, dataset, mesh)
-    stream = batch_stream(config, dataset, env.spec.truncate_in_hindsight, mesh.devices.size)
+    num_devices = mesh.devices.size * processes.count()
+    stream = batch_stream(config, dataset, env.spec.truncate_in_hindsight, num_devices)
     batches = list(islice(stream, num_steps))
 
     def steps(state: Any) -> Any:
@@ -139,10 +162,14 @@ def bench_gradient_step(
     jax.block_until_ready(steps(trainer.init()))  # compiles every shape
     state = trainer.init()
     before = matrix_product_rate()
-    _, cpu = cpu_time(lambda: steps(state))
+    wall = time.perf_counter()
+    _, cpu = shared_cpu_time(lambda: steps(state))
+    wall = time.perf_counter() - wall
     rate = (before + matrix_product_rate()) / 2
     note = f"{config.batch_size} trajectories"
     yield from _step_rows(network, batches, cpu, rate, note)
+    note = f"{processes.count()} processes with {mesh.devices.size} devices each"
+    yield Row("  wall time", wall / len(batches), "s", note)
 
 
 def _step_rows(
