@@ -75,7 +75,11 @@ MAY_WRITE = (
 """Where commands may write that are not refused."""
 
 CONTRADICTIONS: dict[str, tuple[tuple[str, str], ...]] = {
-    "collect": (("--env gridworld --env maze15", "--env"), ("--demonstrator astar4", "astar4")),
+    "collect": (
+        ("--env gridworld --env maze15", "--env"),
+        ("--demonstrator astar4", "astar4"),
+        ("--processes 2", "--distributed"),
+    ),
     "pretrain": (
         ("--batch-size 10 --part-size 4", "--part-size"),
         ("--num-heads 3", "--num-heads"),
@@ -99,6 +103,11 @@ CONTRADICTIONS: dict[str, tuple[tuple[str, str], ...]] = {
         ("--data nowhere", "nowhere"),
         ("--data policy", "policy"),
         ("--env none", "--data"),
+        ("--coordinator here:1", "--distributed"),
+        ("--distributed --coordinator here:1", "--processes"),
+        ("--distributed --coordinator here --processes 2 --process 0", "--coordinator"),
+        ("--distributed --coordinator here:1 --processes 2 --process 2", "--process"),
+        ("--distributed --dry-run", "--distributed"),
     ),
     "data": (
         ("export nowhere --out new.npz", "nowhere"),
@@ -128,11 +137,13 @@ CONTRADICTIONS: dict[str, tuple[tuple[str, str], ...]] = {
         ("--action-noise 1.5", "--action-noise"),
         ("--sweep c", "c=0.1,1,10"),
         ("--sweep min-std=1,2", "min_std"),
+        ("--process 0", "--distributed"),
     ),
     "evaluate": (
         ("--env gridworld", "gridworld"),
         ("--env mgpo_jax.methods:UCB", "UCB"),
         ("--obs-noise official", "official"),
+        ("--processes 2", "--distributed"),
         ("nowhere", "nowhere"),
         ("policy", "policy"),
     ),
@@ -181,10 +192,16 @@ CONTRADICTIONS: dict[str, tuple[tuple[str, str], ...]] = {
         ("table5 --trajectories 40", "--trajectories"),
         ("heads", "heads"),
         ("table6", "table6"),
+        ("--distributed", "--distributed"),
         ("table5 --env gridworld", "table5"),
     ),
     "release": (("policy", "policy"), ("nowhere", "nowhere")),
-    "bench": (("--demonstrator nobody", "demonstrator"),),
+    "bench": (
+        ("--demonstrator nobody", "demonstrator"),
+        ("--layouts 2", "--layouts"),
+        ("--layouts 1x0", "--layouts"),
+        ("--layouts 2x1 --distributed", "--distributed"),
+    ),
     "list": (("maze15", "maze15"),),
     "info": (("maze15", "maze15"),),
 }

@@ -1,0 +1,271 @@
+"""What processes tell each other on the host, and that no collective joins CPU devices of one process."""
+
+from __future__ import annotations
+
+import re
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_runner import Point, tasks_of, untrained
+from test_training import CONFIG, DATASET, NETWORK, WHOLE, parts_of
+
+from envs.errors import UsageError
+from experiments import joining, signals
+from experiments.datasets import _as_one
+from experiments.joining import Joined, check_flags
+from mgpo_jax import processes, runner, sharding
+from mgpo_jax.methods import UCB
+from mgpo_jax.processes import DisagreementError, Door, Member, Team, connected
+from mgpo_jax.runner import sweep
+from mgpo_jax.training import Trainer
+
+COLLECTIVE = re.compile(r"all-reduce|all-gather|all-to-all|collective-permute|reduce-scatter")
+
+
+@contextmanager
+def teams(num: int) -> Iterator[tuple[list[Team], list[list[tuple[str, int, str]]]]]:
+    """Processes that are threads of this one, and what each of them hears."""
+    members = [Member(number, f"host{number}", 100 + number) for number in range(num)]
+    heard: list[list[tuple[str, int, str]]] = [[] for _ in range(num)]
+
+    def hear(index: int) -> Callable[[str, Member, str], None]:
+        return lambda event, member, text: heard[index].append((event, member.number, text))
+
+    door = Door(only_here=True)
+    links: list[dict[int, socket.socket]] = [{}]
+    for number in range(1, num):
+        links.append({0: connected(["127.0.0.1"], door.port, door.password, number)})
+    links[0] = door.let_in(members)
+    made = [Team(members, number, links[number], hear(number)) for number in range(num)]
+    try:
+        yield made, heard
+    finally:
+        for team in made:
+            team.leave(wait=False)
+
+
+def at_once(*works: Callable[[], Any]) -> list[Any]:
+    """The results of several threads."""
+    found: list[Any] = [None] * len(works)
+
+    def run(place: int) -> None:
+        try:
+            found[place] = works[place]()
+        except Exception as error:
+            found[place] = error
+
+    threads = [threading.Thread(target=run, args=(place,)) for place in range(len(works))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(10)
+    return found
+
+
+def soon(condition: Callable[[], Any]) -> None:
+    end = time.monotonic() + 5
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.005)
+    assert condition()
+
+
+def test_all_get_the_pieces_of_all_in_their_order() -> None:
+    large = bytes(range(256)) * 9000
+    with teams(3) as (made, _):
+        pieces = [b"", large, b"two"]
+        works = [lambda i=i: made[i].combine(pieces[i], processes._packed) for i in range(3)]
+        assert [list(processes._unpacked(told)) for told in at_once(*works)] == [pieces] * 3
+        works = [
+            lambda i=i: made[i].combine(b"%d" % i, lambda all_: all_[2] + b"!") for i in range(3)
+        ]
+        assert at_once(*works) == [b"2!"] * 3
+
+
+def test_news_reaches_all_others() -> None:
+    with teams(3) as (made, heard):
+        made[1].tell(processes.SIGNAL, "15")
+        made[0].tell(processes.FAILED, "no room")
+        soon(lambda: heard[0] and len(heard[1]) == 1 and len(heard[2]) == 2)
+        assert heard[0] == [("signal", 1, "15")]
+        assert heard[1] == [("failed", 0, "no room")]
+        assert sorted(heard[2]) == [("failed", 0, "no room"), ("signal", 1, "15")]
+
+
+def test_a_process_that_is_gone_is_missed_by_all_others() -> None:
+    with teams(3) as (made, heard):
+        made[2].leave(wait=False)  # as the operating system does for a process that ends
+        soon(lambda: heard[0] and heard[1])
+        assert heard[0] == heard[1] == [("gone", 2, "")]
+        assert heard[2] == []
+
+
+def test_who_has_come_to_the_end_is_not_missed() -> None:
+    with teams(3) as (made, heard):
+        at_once(*[lambda i=i: made[i].leave(wait=True) for i in range(3)])
+        time.sleep(0.05)
+        assert heard == [[], [], []]
+
+
+def test_strangers_are_not_let_in() -> None:
+    door = Door(only_here=True)
+    members = [Member(0, "here", 1), Member(1, "there", 2)]
+    stranger = connected(["127.0.0.1"], door.port, bytes(16), 1)
+    own = connected(["127.0.0.1"], door.port, door.password, 1)
+    links = door.let_in(members)
+    links[1].sendall(b"x")
+    assert own.recv(1) == b"x"
+    assert stranger.recv(1) == b""
+    with pytest.raises(OSError, match="refused"):
+        socket.create_connection(("127.0.0.1", door.port), timeout=5)
+    for link in (stranger, own, links[1]):
+        link.close()
+
+
+def test_what_differs_is_named_with_its_host(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = threading.local()
+    monkeypatch.setattr(processes, "_together", lambda: own.team)
+    with teams(2) as (made, _):
+
+        def check(index: int, value: str) -> None:
+            own.team = made[index]
+            processes.check_agreed({"--seed": 0, "the dataset's hash": value})
+
+        first, second = at_once(lambda: check(0, "ab"), lambda: check(1, "cd"))
+    assert isinstance(first, DisagreementError)
+    assert str(first) == str(second)
+    said = "process 1 on host1 has the dataset's hash 'cd', not 'ab' as process 0 on host0 has"
+    assert str(first).startswith(said)
+
+
+def test_one_process_needs_nobody() -> None:
+    assert (processes.count(), processes.index(), processes.is_first()) == (1, 0, True)
+    assert processes.total(2.5) == 2.5
+    assert processes.from_first(lambda: {"a": 1}) == {"a": 1}
+    assert processes.arrays_from_first(lambda: None) is None
+    processes.check_agreed({"anything": 1})
+
+
+@pytest.mark.parametrize(
+    ("flags", "says"),
+    [
+        ({"processes": 2}, "--processes is for several processes; add --distributed"),
+        ({"distributed": True, "coordinator": "a:1"}, "--coordinator needs --processes beside it"),
+        (
+            {"distributed": True, "coordinator": "a", "processes": 2, "process": 0},
+            "--coordinator must be HOST:PORT, such as node0:12345, found 'a'",
+        ),
+        (
+            {"distributed": True, "coordinator": "a:1", "processes": 2, "process": 2},
+            "--process counts from 0: of 2 processes the last is 1, found 2",
+        ),
+    ],
+)
+def test_flags_that_do_not_go_together(flags: dict[str, Any], says: str) -> None:
+    with pytest.raises(UsageError, match=re.escape(says)):
+        check_flags(Joined(**flags))
+
+
+def test_requests_of_a_scheduler_to_all_are_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A request to this process and the news of the same to another are no second request."""
+    watch = signals._Watch()
+    monkeypatch.setattr(signals, "_watch", watch)
+    watch.patient = True
+    watch.receive(15)
+    signals.receive(15, 1)
+    signals.receive(15, 2)
+    assert (watch.leaving, len(watch.asked)) == (False, 3)
+    left = threading.Event()
+    monkeypatch.setattr(watch, "_leave", lambda number: left.set())
+    signals.receive(15, 2)
+    assert left.wait(5)
+    assert signals.is_leaving()
+
+
+def test_a_batch_is_put_together_from_its_parts() -> None:
+    """Three kept of four, 2 + 1 + 3 steps; the numbers of those to try again stay in order."""
+    first = {
+        "obs": np.arange(3), "lengths": np.array([2, 1]), "returns": np.array([0.5, 1.0]),
+        "again": np.array([7]), "num_failed": np.array(1), "num_test": np.array(0),
+    }  # fmt: skip
+    second = {
+        "obs": np.arange(10, 15), "lengths": np.array([3, 2]), "returns": np.array([0.25, 0.0]),
+        "again": np.array([8, 9]), "num_failed": np.array(0), "num_test": np.array(2),
+    }  # fmt: skip
+    whole = _as_one([first, second], room=3)
+    np.testing.assert_array_equal(whole["obs"], [0, 1, 2, 10, 11, 12])
+    np.testing.assert_array_equal(whole["lengths"], [2, 1, 3])
+    np.testing.assert_array_equal(whole["returns"], [0.5, 1.0, 0.25])
+    np.testing.assert_array_equal(whole["again"], [7, 8, 9])
+    assert (whole["num_failed"], whole["num_test"]) == (1, 2)
+
+
+@pytest.mark.skipif(jax.device_count() < 2, reason="needs two devices")
+def test_no_collective_joins_devices_of_one_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever is compiled for two CPU devices, in a gradient step and in an adaptation."""
+    compiled = []
+
+    def on_devices(*args: Any, **options: Any) -> Any:
+        program = sharding.on_devices(*args, **options)
+
+        def run(*inputs: Any) -> Any:
+            compiled.append(program.lower(*inputs).compile().as_text())
+            return program(*inputs)
+
+        run.lower = lambda *inputs: _Noted(program.lower(*inputs), compiled)
+        return run
+
+    monkeypatch.setattr("mgpo_jax.training.on_devices", on_devices)
+    monkeypatch.setattr(runner, "on_devices", on_devices)
+    trainer = Trainer(CONFIG, NETWORK, DATASET, sharding.device_mesh(2))
+    trainer.step(trainer.init(), parts_of(4))
+    assert len(compiled) == 4  # to unpack, to add for each of two parts, to pack
+    for function in (runner._program, runner._breaking):
+        function.cache_clear()
+    env = Point()
+    sweep(env, untrained(env), tasks_of(env), UCB, [UCB.hyper()], seeds=1, episodes=2, eval_every=2)
+    for function in (runner._program, runner._breaking):
+        function.cache_clear()
+    assert len(compiled) > 6
+    assert [text for text in compiled if COLLECTIVE.search(text)] == []
+
+
+class _Noted:
+    """A lowered program whose text is noted when it is compiled."""
+
+    def __init__(self, lowered: Any, texts: list[str]) -> None:
+        self._lowered, self._texts = lowered, texts
+
+    def compile(self) -> Any:
+        done = self._lowered.compile()
+        self._texts.append(done.as_text())
+        return done
+
+
+@pytest.mark.skipif(jax.device_count() < 2, reason="needs two devices")
+def test_a_collective_between_them_is_refused() -> None:
+    mesh = sharding.device_mesh(2)
+    with pytest.raises(AssertionError):
+        sharding.sum_by_collective(mesh, mesh, jnp.ones((2, 3)))
+    sharding.check_collective(sharding.device_mesh(1))
+
+
+def test_sums_of_accelerators_are_those_of_copies() -> None:
+    """The form of accelerators, on the one device where a CPU may have it."""
+    mesh = sharding.device_mesh(1)
+    tree = {"a": jnp.arange(6.0).reshape(1, 2, 3), "b": jnp.full((1,), 7.0)}
+    (row,) = sharding._splitting(tree)(sharding.sum_by_collective(mesh, mesh, tree)[None])
+    (copied,) = sharding.gather_rows(mesh, tree)
+    jax.tree.map(np.testing.assert_array_equal, row, copied)
+    np.testing.assert_array_equal(WHOLE.indices, np.arange(8))
+
+
+def test_names_of_the_flags() -> None:
+    assert joining.OF_PROCESSES == ("distributed", "coordinator", "processes", "process")
