@@ -41,6 +41,7 @@ SECTIONS: tuple[tuple[str, Sequence[str]], ...] = (
     ("How it works", ["architecture.md", "plan.md", "environments.md"]),
     ("API reference", ["api/mgpo_jax.md", *(f"api/{name}.md" for name in MODULES)]),
     ("Speed", ["speed.md"]),
+    ("Scale", ["scale.md"]),
     ("Safety", ["safety.md"]),
     ("Limitations", ["limitations.md"]),
     ("Project", ["contributing.md", "changelog.md"]),
