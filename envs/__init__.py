@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from envs.compiler import avoid_fault
 from envs.registry import Judgement, World, find, make, names, register
 
 if TYPE_CHECKING:
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
         Trajectory,
     )
     from envs.checks import check_world
+
+avoid_fault()
 
 __all__ = [
     "Agent",

@@ -10,6 +10,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from envs.compiler import avoid_fault
+
 if TYPE_CHECKING:
     from envs.base import (
         Agent,
@@ -44,6 +46,8 @@ if TYPE_CHECKING:
     from mgpo_jax.settings import TrainConfig, static
     from mgpo_jax.tasks import load_tasks, sample_tasks, save_tasks, test_tasks
     from mgpo_jax.training import pretrain
+
+avoid_fault()
 
 _PLACES = {
     "envs.base": (

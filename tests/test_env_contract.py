@@ -175,7 +175,7 @@ def test_different_worlds_differ():
 
 
 def test_vmap_equals_loop(world):
-    for lane in range(3):
+    for lane in (0, 1, NUM_LANES // 2, NUM_LANES - 1):  # a fault of XLA began with the ninth
         task = jax.tree.map(lambda leaf, lane=lane: leaf[lane], world["easy"])
         alone = play_one(world["env"], world["keys"][lane], task)
         together = [
