@@ -11,16 +11,19 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 import jax
 import jaxtyping
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 
 TWO_DEVICES = "--xla_force_host_platform_device_count=2"
 """So that what is spread over devices is tested as such."""
-# Most of the time of a test is compiling a program that runs for milliseconds. Without optimization, and with
-# the older emitters of loops, that takes a quarter of the time. With --all, programs compile as for users.
+# Most of the time of a test is compiling a program that runs for milliseconds. Without optimization, and
+# with the older emitters of loops, that takes a quarter of the time. With --all, all compile as for users.
 QUICK = (
     f"{TWO_DEVICES} --xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true "
     "--xla_cpu_use_fusion_emitters=false"
 )
 """Flags of XLA with which compiling takes little time."""
+MIN_COMPILE_SECONDS = 0.05
+"""Programs that compile faster are not kept: writing and reading them takes time, too."""
 
 jaxtyping.install_import_hook(["mgpo_jax", "envs"], "beartype.beartype")
 jax.config.update("jax_numpy_rank_promotion", "allow")
@@ -51,6 +54,16 @@ def require_kitchen() -> None:
         import_mujoco()
     except ImportError as error:
         pytest.skip(str(error), allow_module_level=True)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _compiled_once(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Keep programs from one test to the next, and for all workers of a run, as commands keep them."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "compiled"
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", MIN_COMPILE_SECONDS)
+    compilation_cache.reset_cache()  # some modules compile while they are imported
 
 
 MOST_MAPPINGS = 15_000  # of a process's memory; Linux ends a program that wants more than 65,530

@@ -17,7 +17,6 @@ import jax
 import numpy as np
 import pytest
 from hostile.work import Evaluation
-from jax.experimental.compilation_cache import compilation_cache
 from jax.flatten_util import ravel_pytree
 
 from envs.base import ArraySpec, Discrete, EnvSpec
@@ -65,20 +64,6 @@ def after_four_steps() -> Iterator[Callable[[], int]]:
     """Ctrl-C, asked for after every step."""
     asked = iter([0, 0, 0, signal.SIGINT])
     yield lambda: next(asked)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Programs are kept from one training to the next, as commands keep them."""
-    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
-    before = {name: getattr(jax.config, name) for name in names}
-    for name, value in zip(names, (str(tmp_path_factory.mktemp("cache")), 0.05), strict=True):
-        jax.config.update(name, value)
-    compilation_cache.reset_cache()
-    yield
-    for name, value in before.items():
-        jax.config.update(name, value)
-    compilation_cache.reset_cache()
 
 
 @pytest.fixture(scope="module")

@@ -7,11 +7,9 @@ import json
 import shutil
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 from hostile.work import Evaluation, WorkBegan, begin
-from jax.experimental.compilation_cache import compilation_cache
 
 from experiments import runtime, training
 from experiments.parsing import parse
@@ -52,19 +50,6 @@ def pretrain(words: str) -> int:
     with pytest.raises(SystemExit) as stop:
         importlib.import_module("experiments.pretrain").command(words.split())
     return int(stop.value.code or 0)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _compiled_once(tmp_path_factory):
-    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
-    before = {name: getattr(jax.config, name) for name in names}
-    for name, value in zip(names, (str(tmp_path_factory.mktemp("cache")), 0.05), strict=True):
-        jax.config.update(name, value)
-    compilation_cache.reset_cache()
-    yield
-    for name, value in before.items():
-        jax.config.update(name, value)
-    compilation_cache.reset_cache()
 
 
 @pytest.fixture(scope="module")
