@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gc
 import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -35,6 +37,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "slow: runs only with --all")
+    config.addinivalue_line("markers", "optimized: runs with programs that compile as for users")
     # XLA reads its flags when jax first needs a device, which is after this.
     os.environ.setdefault("XLA_FLAGS", TWO_DEVICES if config.getoption("--all") else QUICK)
 
@@ -44,6 +47,30 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         for item in items:
             if "slow" in item.keywords:
                 item.add_marker(pytest.mark.skip(reason="slow: pass --all"))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """Run a test in a process of its own where its programs must be optimized and are not here.
+
+    XLA reads its flags once in a process. These tests compare bits of different programs, or look at what
+    many steps make of small differences.
+    """
+    if "optimized" not in pyfuncitem.keywords or os.environ["XLA_FLAGS"] != QUICK:
+        return None
+    words = [sys.executable, "-m", "pytest", "-p", "no:xdist", "-p", "no:cacheprovider"]
+    variables = {k: v for k, v in os.environ.items() if not k.startswith("PYTEST_")}
+    done = subprocess.run(
+        [*words, str(pyfuncitem.path) + pyfuncitem.nodeid[pyfuncitem.nodeid.index("::") :]],
+        cwd=pyfuncitem.config.rootpath,
+        env={**variables, "XLA_FLAGS": TWO_DEVICES},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "1 passed" in done.stdout, done.stdout
+    return True
 
 
 def require_kitchen() -> None:

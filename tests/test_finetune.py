@@ -315,6 +315,7 @@ def test_a_strong_penalty_keeps_the_policy(params: Any, round_of_episodes: Any) 
     assert moved(100.0) < 0.2 * moved(0.0)
 
 
+@pytest.mark.optimized
 def test_a_round_ends_when_the_policy_has_moved_too_far(
     params: Any, round_of_episodes: Any
 ) -> None:

@@ -93,6 +93,7 @@ class TestTheSameIsReached:
         assert own.return_ == pytest.approx(theirs.return_)
         assert own._replace(return_=0.0) == theirs._replace(return_=0.0)
 
+    @pytest.mark.optimized
     def test_to_the_last_bit(self):
         """What is observed of a demonstration, contact included, is the same float32 numbers."""
         trajectory = demonstration((LIGHT,)).trajectory

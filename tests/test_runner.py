@@ -237,7 +237,10 @@ def test_prompts_evaluated_again_have_the_same_returns(swept, tasks):
     np.testing.assert_allclose(blind[0], blind[1], atol=0.4)
 
 
-@pytest.mark.parametrize(("env", "judged"), [(MAZE, None), (GRID, THREE), (Point(), THREE)])
+@pytest.mark.parametrize(
+    ("env", "judged"),
+    [(MAZE, None), (GRID, THREE), pytest.param(Point(), THREE, marks=pytest.mark.optimized)],
+)
 def test_a_policy_that_never_adapts_is_judged_like_a_search_before_it_begins(env, judged):
     """Bit for bit: the same prompt in the same episodes."""
     search, fixed = run_of(env, "ucb", judged), run_of(env, "gcbc", judged)
