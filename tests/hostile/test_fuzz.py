@@ -23,6 +23,7 @@ from .cases import Case
 from .fuzz import Ended, report
 from .grammar_flags import BASE, COMMANDS, all_flags
 from .grammar_npz import bomb, npy
+from .processes import XLA_FLAGS
 from .work import WorkBegan
 
 ROOT = Path(__file__).parents[2]
@@ -44,8 +45,12 @@ def _fuzz(material: Path, tmp_path: Path, first: int, cases: int) -> None:
     command = [sys.executable, "-m", "hostile.fuzz", *map(str, words), "--json", str(where)]
     cache = str(material.parent / "cache")  # of compiled programs
     path = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
-    environment = {**os.environ, "PYTHONPATH": path, "MGPO_CACHE": cache}
-    environment.pop("XLA_FLAGS", None)
+    environment = {
+        **os.environ,
+        "PYTHONPATH": path,
+        "MGPO_CACHE": cache,
+        "XLA_FLAGS": XLA_FLAGS,
+    }
     done = subprocess.run(
         [*command, "--report", str(tmp_path / "report.md")],
         cwd=ROOT,
