@@ -1,10 +1,10 @@
 """A fault of XLA's CPU compiler that would silently give wrong numbers, and the option that avoids it.
 
 jaxlib 0.10.2 hands reductions to a library of kernels (YNNPACK). A sum over the products of an array and
-one that is broadcast along its leading axes, which goes on into other arithmetic in the same kernel, is wrong
-beyond the first 128 KB of results (https://github.com/jax-ml/jax/issues/39103). It is right in 0.10.1, by
-that report, and in 0.11.2. The noise that Crafter's maps are made of is such a sum: the first eight worlds of
-a batch were right, and all others were not those of their seeds.
+one that is broadcast along its leading axes, which goes on into other arithmetic in the same kernel, is
+wrong beyond the first 128 KB of results (https://github.com/jax-ml/jax/issues/39103). It is right in
+0.10.1, by that report, and in 0.11.2. The noise that Crafter's maps are made of is such a sum: the first
+eight worlds of a batch were right, and all others were not those of their seeds.
 """
 
 from __future__ import annotations

@@ -165,7 +165,7 @@ def multiplied_out(
     light: Float[Array, "*batch 1"],
     asleep: Int[Array, "*batch"],
 ) -> Float[Array, "*batch E"]:
-    """The sum of ``looked_up`` over cells, as a product with one-hots, so that its gradient is a product, too.
+    """The sum of ``looked_up`` over cells, as a product with one-hots, whose gradient is a product, too.
 
     Args:
       tables: those of the cells.

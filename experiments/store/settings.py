@@ -605,8 +605,8 @@ def check_reproduction(config: ReproduceConfig) -> None:
     """Raise ``UsageError`` for settings of ``experiments.reproduce`` that do not go together."""
     if config.distributed and config.what not in COMPARISONS:
         raise UsageError(
-            f"--distributed spreads the cells of a comparison; {config.what} is made by one process, leave it "
-            f"out or name one of {', '.join(COMPARISONS)}"
+            f"--distributed spreads the cells of a comparison; {config.what} is made by one process, leave "
+            f"it out or name one of {', '.join(COMPARISONS)}"
         )
     if config.what not in ABLATIONS:
         useless = ["steps", "trajectories"]
