@@ -87,10 +87,8 @@ def make_comparison(config: ReproduceConfig) -> None:
     with processes.apart():  # process 0 has all cells now, and makes the table by itself
         say(robustness.compare(config) if behind_noise else comparisons.compare(config))
     place = comparisons.files_of(config)[0]
-    print(
-        f"table in {place}" if behind_noise else f"table and curves in {place} and .png",
-        file=sys.stderr,
-    )
+    text = f"table in {place}" if behind_noise else f"table and curves in {place} and .png"
+    print(text, file=sys.stderr)
 
 
 def make_all(config: ReproduceConfig) -> None:
