@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from envs.compiler import avoid_fault
+import envs.compiler
 
 if TYPE_CHECKING:
     from envs.base import (
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from mgpo_jax.tasks import load_tasks, sample_tasks, save_tasks, test_tasks
     from mgpo_jax.training import pretrain
 
-avoid_fault()
+envs.compiler.avoid_fault()
 
 _PLACES = {
     "envs.base": (
