@@ -75,6 +75,7 @@ def adapt_all(
         keep_actions=first.keep_actions,
         stop_at=first.stop_at,
         journal=journal,
+        begin=expect_compiling,
     )
 
 
@@ -135,7 +136,6 @@ def adapt_and_save(
     """
     settings = deciding(config, policy, tasks)
     with long_work(folder, settings, provenance(), config.resume) as work:
-        expect_compiling()
         (outcome,) = adapt_all(world, env, policy, tasks, [config], work.journal)
         if not processes.is_first():
             return None

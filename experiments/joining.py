@@ -60,7 +60,8 @@ def check_flags(config: Joined) -> None:
     """Raise ``UsageError`` for flags of several processes that do not go together."""
     given = [name for name in OF_PROCESSES[1:] if getattr(config, name) is not None]
     if given and not config.distributed:
-        raise UsageError(f"{flag(given[0])} is for several processes; add --distributed")
+        value = shown(getattr(config, given[0]))
+        raise UsageError(f"{flag(given[0])} {value} is for several processes; add --distributed")
     if config.distributed and getattr(config, "dry_run", False):
         raise UsageError("--dry-run computes nothing that could be spread; leave out --distributed")
     if given and len(given) < 3:

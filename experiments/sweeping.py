@@ -14,7 +14,7 @@ from envs.base import Environment, Task
 from envs.errors import UsageError, nearest, shown
 from envs.registry import World
 from experiments.adaptation import adapt_all, deciding, results_with_summary
-from experiments.runtime import expect_compiling, say
+from experiments.runtime import say
 from experiments.store.provenance import provenance
 from experiments.store.results import write_results
 from experiments.store.settings import AdaptConfig
@@ -106,7 +106,6 @@ def sweep_and_save(
     named = variants(config)
     settings = {name: deciding(variant, policy, tasks) for name, variant in named.items()}
     with long_work(config.folder, settings, provenance(), config.resume) as work:
-        expect_compiling()
         outcomes = adapt_all(world, env, policy, tasks, list(named.values()), work.journal)
         if not processes.is_first():
             outcomes, named = [], {}

@@ -479,7 +479,8 @@ def _take_steps(
     clock, since = time.process_time(), state.step
     with Progress(num_steps, "step", initial=state.step) as progress:
         while state.step < num_steps:
-            state, row = run.trainer.step(state, next(batches), stopping())
+            asked = (stopping(),) if processes.count() > 1 else ()  # told to the others
+            state, row = run.trainer.step(state, next(batches), *asked)
             known, newest = newest, [(state.step, row)]
             pending += [finite_metrics(*step) for step in known]  # computed by now: no waiting
             progress.update()

@@ -179,6 +179,7 @@ def sweep(
     keep_actions: bool = False,
     stop_at: float | None = None,
     journal: Journal | None = None,
+    begin: Callable[[], object] = lambda: None,
 ) -> list[Outcome]:
     """One outcome for each variant of a method's hyper-parameters, all from one program.
 
@@ -198,6 +199,7 @@ def sweep(
       stop_at: a search ends when its best choice is judged at this return or more (``stopping``); the
         episodes that it did not need have the best return that it had seen, and no steps.
       journal: where finished segments are kept; those that it holds are not run again.
+      begin: called once, when everything was found right and before anything is compiled.
 
     Raises:
       UsageError: if a number is below 1, there are no tasks, the results would not fit into memory, or the
@@ -211,6 +213,7 @@ def sweep(
     segments, num = _segments(adapter, episodes, eval_every), adapter.episodes_per_round
     grid = Grid(variants=len(hypers), seeds=seeds, tasks=num_tasks(tasks))
     _check_room(env, grid, episodes)
+    begin()
     layout = _lay_out(env, grid.size, _memory_bytes(env, adapter, tasks))
     program = _program(method, setting, fixed, layout, max(segments), keep_actions)
     lanes = grid.lanes(layout, tasks, seed, numbers, ends_early=stop_at is not None)

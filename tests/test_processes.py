@@ -156,7 +156,7 @@ def test_one_process_needs_nobody() -> None:
 @pytest.mark.parametrize(
     ("flags", "says"),
     [
-        ({"processes": 2}, "--processes is for several processes; add --distributed"),
+        ({"processes": 2}, "--processes 2 is for several processes; add --distributed"),
         ({"distributed": True, "coordinator": "a:1"}, "--coordinator needs --processes beside it"),
         (
             {"distributed": True, "coordinator": "a", "processes": 2, "process": 0},
