@@ -188,8 +188,7 @@ def sweep(
       policy: who starts.
       tasks: N tasks, stacked.
       method: who adapts.
-      hypers: the variants. All see the same tasks and random keys; their numbers are data, so that a
-        sweep compiles once.
+      hypers: the variants, which see the same tasks and random keys and share one program.
       seeds: independent adaptations to each task.
       episodes: the budget of each.
       seed: seed of all of them.
@@ -202,8 +201,7 @@ def sweep(
       begin: called once, when everything was found right and before anything is compiled.
 
     Raises:
-      UsageError: if a number is below 1, there are no tasks, the results would not fit into memory, or the
-        method cannot be used in this setting.
+      UsageError: for a number below 1, no tasks, results beyond the memory, or a method that does not fit.
       DataError: if the policy was made for another world, or a return is not finite.
     """
     _check_positive(seeds=seeds, episodes=episodes, eval_every=eval_every)
@@ -224,8 +222,7 @@ def sweep(
     # The search, too, begins with one evaluation of the initial choice.
     after = np.concatenate([[1], np.cumsum(segments) * num])
     per_lane = episodes + (len(segments) + 1) * setting.judged.episodes
-    total = round(layout.num_lanes * per_lane / grid.variants)
-    cpu /= grid.variants
+    total, cpu = round(layout.num_lanes * per_lane / grid.variants), cpu / grid.variants
     return [record.outcome(i, grid, after, total, cpu) for i in range(grid.variants)]
 
 
