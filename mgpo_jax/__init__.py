@@ -10,8 +10,6 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-import envs.compiler
-
 if TYPE_CHECKING:
     from envs.base import (
         Agent,
@@ -46,8 +44,6 @@ if TYPE_CHECKING:
     from mgpo_jax.settings import TrainConfig, static
     from mgpo_jax.tasks import load_tasks, sample_tasks, save_tasks, test_tasks
     from mgpo_jax.training import pretrain
-
-envs.compiler.avoid_fault()
 
 _PLACES = {
     "envs.base": (
