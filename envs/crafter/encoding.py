@@ -46,10 +46,10 @@ TILE = UNIT * UNIT * 3  # numbers of a tile
 
 
 class Shown(NamedTuple):
-    """Which tile each of some observations shows at one cell, and in which light."""
+    """Which tiles each of some observations shows at some cells, and in which light."""
 
-    row: Int[Array, "*batch"]
-    """The number of the tile."""
+    row: Int[Array, "*batch cells"]
+    """The numbers of the tiles."""
     light: Float[Array, "*batch 1"]
     """From 0 by night to 1 by day."""
     asleep: Int[Array, "*batch"]
@@ -110,31 +110,21 @@ def _with_cells(
     """The token plus what the cells in view look like, with weights for being awake and asleep.
 
     On a CPU this goes cell by cell: what all cells look like at once would fill the memory. An accelerator
-    is slow at scattering the gradient over the tables and fast at products (``multiplied_out``).
+    is slow at scattering the gradient over the tables and fast at products.
     """
     codes = jnp.clip(jnp.round(obs[..., :NUM_CELLS]), 0, NUM_CODES - 1).astype(jnp.int32)
     asleep = (obs[..., ASLEEP] > 0.5).astype(jnp.int32)
     light = obs[..., LIGHT, None]
-
-    def add(token: Array, cell: tuple[Array, Array]) -> tuple[Array, None]:
-        table, row = cell
-        return token + looked_up(table, Shown(row, light, asleep)), None
-
     others = np.delete(np.arange(NUM_CELLS), MIDDLE)
-    rows = jnp.moveaxis(codes[..., others], -1, 0)
-    # All tables outside of the loop: they follow from the weights alone, and an episode makes them once.
-    of_cells = tables("day", kernels[:, others])
-    if jax.default_backend() == "cpu":
-        token, _ = jax.lax.scan(add, token, (of_cells, rows))
-    else:
-        token = token + multiplied_out(of_cells, codes[..., others], light, asleep)
     facing = jnp.argmax(obs[..., NUM_CELLS + NUM_COUNTS :][..., :NUM_FACINGS], axis=-1)
     who = jnp.where(asleep > 0, NUM_FACINGS, facing)
-    row = who * NUM_BLOCKS + codes[..., MIDDLE] % NUM_BLOCKS
+    player = who * NUM_BLOCKS + codes[..., MIDDLE] % NUM_BLOCKS
+    # All tables outside of loops: they follow from the weights alone, and an episode makes them once.
+    of_cells = tables("day", kernels[:, others])
     of_player = tables("player", kernels[:, MIDDLE : MIDDLE + 1])
-    if jax.default_backend() == "cpu":
-        return token + looked_up(of_player[0], Shown(row, light, asleep))
-    return token + multiplied_out(of_player, row[..., None], light, asleep)
+    add = _with_looked_up if jax.default_backend() == "cpu" else _with_multiplied
+    token = add(token, of_cells, Shown(codes[..., others], light, asleep))
+    return add(token, of_player, Shown(player[..., None], light, asleep))
 
 
 def tables(kind: str, kernels: Float[Array, "2 cells TILE E"]) -> Float[Array, "cells 2 2 rows E"]:
@@ -148,35 +138,28 @@ def tables(kind: str, kernels: Float[Array, "2 cells TILE E"]) -> Float[Array, "
     return jnp.einsum("lrt,scte->cslre", flat, kernels)
 
 
-def looked_up(table: Float[Array, "2 2 rows E"], shown: Shown) -> Float[Array, "*batch E"]:
-    """The products of the tiles that are shown at one cell, mixed by the light.
-
-    Args:
-      table: those of the cell (``tables``).
-      shown: which tile each observation shows.
-    """
-    day, night = (table[shown.asleep, index, shown.row] for index in (0, 1))
-    return shown.light * day + (1 - shown.light) * night
-
-
-def multiplied_out(
-    tables: Float[Array, "cells 2 2 rows E"],
-    rows: Int[Array, "*batch cells"],
-    light: Float[Array, "*batch 1"],
-    asleep: Int[Array, "*batch"],
+def _with_looked_up(
+    token: Float[Array, "*batch E"], tables: Float[Array, "cells 2 2 rows E"], shown: Shown
 ) -> Float[Array, "*batch E"]:
-    """The sum of ``looked_up`` over cells, as a product with one-hots, whose gradient is a product, too.
+    """The token plus the products of the tiles that are shown, mixed by the light, cell by cell."""
 
-    Args:
-      tables: those of the cells.
-      rows: the number of the tile that is shown at each cell.
-      light, asleep: as in ``Shown``.
-    """
-    hot = jax.nn.one_hot(rows, tables.shape[-2], dtype=tables.dtype)
+    def add(token: Array, cell: tuple[Array, Array]) -> tuple[Array, None]:
+        table, row = cell
+        day, night = (table[shown.asleep, index, row] for index in (0, 1))
+        return token + (shown.light * day + (1 - shown.light) * night), None
+
+    return jax.lax.scan(add, token, (tables, jnp.moveaxis(shown.row, -1, 0)))[0]
+
+
+def _with_multiplied(
+    token: Float[Array, "*batch E"], tables: Float[Array, "cells 2 2 rows E"], shown: Shown
+) -> Float[Array, "*batch E"]:
+    """The same as one product with one-hots, whose gradient is a product, too."""
+    hot = jax.nn.one_hot(shown.row, tables.shape[-2], dtype=tables.dtype)
     by_light = jnp.einsum("...cr,cslre->...sle", hot, tables)
-    lights = jnp.concatenate([light, 1 - light], axis=-1)
-    states = jax.nn.one_hot(asleep, 2, dtype=tables.dtype)
-    return jnp.einsum("...s,...l,...sle->...e", states, lights, by_light)
+    lights = jnp.concatenate([shown.light, 1 - shown.light], axis=-1)
+    states = jax.nn.one_hot(shown.asleep, 2, dtype=tables.dtype)
+    return token + jnp.einsum("...s,...l,...sle->...e", states, lights, by_light)
 
 
 def _with_items(
@@ -193,6 +176,6 @@ def _with_items(
         shown_count = jnp.clip(counts[..., index], 0, MAX_COUNT)
         if jax.default_backend() == "cpu":
             token = token + table[shown_count]
-        else:  # for the reason given in ``_with_cells``
+        else:  # as in ``_with_cells``
             token = token + jax.nn.one_hot(shown_count, MAX_COUNT + 1, dtype=table.dtype) @ table
     return token
