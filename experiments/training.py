@@ -20,7 +20,7 @@ from envs.base import Demonstrator, Environment, EnvSpec, Task
 from envs.episodes import run_episode
 from envs.errors import DataError, UsageError
 from envs.registry import World
-from experiments.datasets import find_demonstrator, own_dataset, prepare_dataset
+from experiments.datasets import find_demonstrator
 from experiments.figures import training_curve
 from experiments.runtime import expect_compiling
 from experiments.signals import Stopped, asked_to_stop, farewell
@@ -34,6 +34,7 @@ from experiments.store.settings import (
     initial_folder,
     mend_initial,
 )
+from experiments.training_data import own_dataset, prepare_dataset
 from mgpo_jax import processes
 from mgpo_jax.checkpoint import (
     Snapshot,

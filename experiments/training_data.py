@@ -1,0 +1,106 @@
+"""The dataset of a training: a user's own, or demonstrations, collected where they are missing."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import envs
+from envs.base import Environment
+from envs.errors import DataError, UsageError
+from envs.registry import World
+from experiments.datasets import collect_and_save, find_demonstrator
+from experiments.store.settings import CollectConfig, PretrainConfig, dataset_folder
+from experiments.store.work import PIECES
+from mgpo_jax import processes
+from mgpo_jax.dataset import Dataset, load_dataset, spec_of
+from mgpo_jax.files import ExistsError, remove_leftovers
+from mgpo_jax.manifest import mend_for, read_facts
+from mgpo_jax.tasks import benchmark_tasks, task_hashes
+
+
+def own_dataset(config: PretrainConfig, env: Environment | None) -> tuple[Dataset, Path, str]:
+    """A dataset that a user brought, its folder and its hash; no test task of the world is in it.
+
+    Args:
+      config: of the training.
+      env: the world that it must fit, if any.
+
+    Raises:
+      DataError: if the dataset there is damaged, does not fit or holds a test task.
+    """
+    folder = config.data.data_folder
+    assert folder is not None
+    spec = env.spec if env is not None else spec_of(read_facts(folder))
+    try:
+        dataset, manifest = load_dataset(folder, spec)
+    except DataError as error:
+        if env is None:
+            raise
+        mend = f"import it again as it is in {config.env}, or leave --env out if it is of no world"
+        raise DataError(str(error).replace(mend_for(folder), mend)) from None
+    dataset = dataset.slice(0, config.data.trajectories)
+    if env is not None and dataset.task_hashes is not None:
+        refuse_test_tasks(dataset, env, envs.find(config.env), folder)
+    return dataset, folder, manifest["sha256"]
+
+
+def refuse_test_tasks(dataset: Dataset, env: Environment, world: World, folder: Path) -> None:
+    """Raise ``DataError`` if a trajectory is of a task that is kept for test."""
+    forbidden = task_hashes(env, benchmark_tasks(env, world.num_test_tasks))
+    if dataset.task_hashes is not None and np.isin(dataset.task_hashes, forbidden).any():
+        raise DataError(f"{folder} holds a test task; remove it and collect it again")
+
+
+def prepare_dataset(
+    config: PretrainConfig, world: World, env: Environment, go_on: str
+) -> tuple[Dataset, Path, str]:
+    """The dataset of a training, its folder and its hash; no test task is in it.
+
+    It is collected first where it is not there yet. Where another process collects it, that one is waited
+    for. ``go_on`` says what continues the command after a stop.
+
+    Raises:
+      DataError: if the dataset there is damaged, out of date or holds a test task.
+      UsageError: if nothing of it would be left to train on.
+    """
+    name, demonstrator = find_demonstrator(world, env, config.data.demonstrator)
+    wanted = CollectConfig(
+        env=config.env,
+        demonstrator=name,
+        trajectories=config.data.trajectories,
+        seed=config.data.data_seed,
+    )
+    folder = dataset_folder(wanted, name)
+    if processes.is_first():
+        remove_leftovers(folder, PIECES)
+    if not processes.from_first(folder.exists):
+        text = f"no dataset in {folder} yet: {wanted.trajectories} trajectories are collected first"
+        print(text, file=sys.stderr)
+        # Another command may have collected it meanwhile, which processes that collect together do not see.
+        with suppress(*[ExistsError] * (processes.count() == 1)):
+            collect_and_save(replace(wanted, resume=True), True, go_on)
+        processes.exchange(b"")  # from here on it is there for all
+    made = {
+        "env": config.env,
+        "policy": name,
+        "seed": wanted.seed,
+        "num_trajectories": wanted.trajectories,
+    }
+    dataset, manifest = load_dataset(folder, env.spec, made)
+    settings, made_with = dict(demonstrator.settings), manifest.get("settings", {})
+    if made_with != settings:
+        raise DataError(
+            f"{folder} was collected by the demonstrator with {made_with or 'no settings'}, which now "
+            f"has {settings or 'none'}; remove it, and it is collected again"
+        )
+    refuse_test_tasks(dataset, env, world, folder)
+    if config.holdout >= len(dataset):
+        raise UsageError(
+            f"--holdout {config.holdout} leaves nothing of {len(dataset)} trajectories"
+        )
+    return dataset, folder, manifest["sha256"]
