@@ -30,11 +30,9 @@ from envs.errors import DataError, shown
 Value = TypeVar("Value")
 
 MEETING = 60.0  # seconds in which all processes must have connected
-SILENT, PROBES, BETWEEN = (
-    10,
-    3,
-    5,
-)  # seconds, number and seconds: when a host that is gone counts as gone
+# A host that has been silent for so many seconds is asked so many times, with seconds between, and then
+# counts as gone.
+SILENT, PROBES, BETWEEN = 10, 3, 5
 
 _HEAD = struct.Struct(">cIQ")  # kind, number of the process it is from, bytes that follow
 _PIECE, _DONE, _SIGNAL, _FAILED, _GONE = b"p", b"d", b"s", b"f", b"g"
