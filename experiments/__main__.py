@@ -26,6 +26,7 @@ COMMANDS = {
     "reproduce": "make tables and figures of the paper",
     "release": "package a pre-training run as a released policy",
     "bench": "measure speed in CPU time",
+    "completion": "print a script that lets a shell complete these words",
 }
 
 
@@ -39,6 +40,8 @@ def main() -> None:
     if words[0] == "--version":
         print(f"mgpo {version('mgpo-jax')}")
         sys.exit(0)
+    if words[0] == "--tyro-print-completion":  # as programs made with tyro have it
+        words[0] = "completion"
     if words[0] not in COMMANDS:
         print(f"error: {nearest(words[0], COMMANDS, 'command')}", file=sys.stderr)
         sys.exit(2)

@@ -65,6 +65,7 @@ BASE: dict[str, tuple[str, tuple[str, ...]]] = {
     "reproduce": ("table4 --seeds 1 --out new", ()),
     "release": ("run --out new", ("run",)),
     "bench": ("--quick --json new.json", ()),
+    "completion": ("bash", ()),
 }
 """A sound command line for each command, and the sound material in the current folder that it needs."""
 
@@ -204,6 +205,7 @@ CONTRADICTIONS: dict[str, tuple[tuple[str, str], ...]] = {
     ),
     "list": (("maze15", "maze15"),),
     "info": (("maze15", "maze15"),),
+    "completion": (("bsh", "bash"), ("bash zsh", "zsh")),
 }
 """Words that contradict each other or the sound input, and what the refusal has to name."""
 
