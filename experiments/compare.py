@@ -26,6 +26,8 @@ class CompareConfig(Common):
     """Their world, for a world of your own (module:attribute)."""
     csv: Path | None = None
     """File to write the return of each task and run to, as comma-separated values."""
+    profile: Path | None = None
+    """Picture to draw (.png): the share of tasks in which a run is at least so good, for every "so good"."""
 
 
 def main(config: CompareConfig) -> None:
@@ -38,6 +40,10 @@ def main(config: CompareConfig) -> None:
         )
     if config.csv is not None:
         refuse_existing_file(config.csv, "--csv")
+    if config.profile is not None:
+        if config.profile.suffix != ".png":
+            raise UsageError(f"--profile {config.profile} must end in .png")
+        refuse_existing_file(config.profile, "--profile")
     if config.env is not None:
         envs.find(config.env)  # from now on results may name its place
     from experiments.pairing import as_csv, as_table, differing
@@ -52,6 +58,12 @@ def main(config: CompareConfig) -> None:
         from mgpo_jax.files import write_text
 
         write_text(config.csv, as_csv(config.runs, results))
+    if config.profile is not None:
+        from experiments.drawing import labeled, write
+        from experiments.figures import later, performance_profiles
+
+        named = labeled(dict(zip(config.runs, results, strict=True)))
+        write(config.profile, later(performance_profiles, named, results[0].env))
 
 
 def command(argv: Sequence[str] | None = None) -> NoReturn:

@@ -11,7 +11,9 @@ import pytest
 
 from envs.errors import UsageError
 from experiments.compare import CompareConfig, main
+from experiments.figures import performance_profiles
 from experiments.store.results import load_results
+from experiments.store.statistics import performance_profile
 
 RESULTS = Path(__file__).parent.parent / "results"
 UCB, PLAN = RESULTS / "maze15" / "ucb", RESULTS / "maze15" / "plan"
@@ -59,6 +61,43 @@ def test_what_makes_it_unequal_is_said(tmp_path: Path, capsys: pytest.CaptureFix
     said = capsys.readouterr().err
     assert "warning: the runs have different weights" in said
     assert f"{other} 000000000000" in said
+
+
+def test_a_profile_is_the_share_of_scores_above_each_threshold() -> None:
+    scores = np.array([[0.0, 1.0, 2.0, 2.0], [0.0, 1.0, 2.0, 4.0]])
+    thresholds = np.array([-1.0, 0.0, 0.5, 2.0, 4.0, 5.0])
+    profile = performance_profile(scores, thresholds)
+    np.testing.assert_allclose(profile.share, [1, 1, 0.75, 0.5, 0.125, 0])
+    assert profile.low is not None
+    assert profile.high is not None
+    assert np.all(profile.low <= profile.share)
+    assert np.all(profile.share <= profile.high)
+    # Only the seeds of the last task differ, so that only its score is uncertain.
+    np.testing.assert_allclose((profile.high - profile.low)[:4], 0)
+    assert performance_profile(scores[:1], thresholds).low is None
+
+
+def test_profiles_are_drawn_by_regret_where_optima_are_known(tmp_path: Path) -> None:
+    main(CompareConfig(runs=(UCB, PLAN), profile=tmp_path / "profile.png"))
+    assert (tmp_path / "profile.png").read_bytes().startswith(b"\x89PNG")
+    known, unknown = (
+        performance_profiles({"ucb": load_results(RESULTS / world / "ucb")}).axes[0]
+        for world in ("maze15", "crafter-map")
+    )
+    assert known.get_xlabel() == "regret of at most"
+    assert unknown.get_xlabel() == "return of at least"
+    line = known.get_lines()[0]
+    last = float(line.get_ydata()[-1])  # at a regret of almost nothing
+    solved = load_results(UCB).summary["solved_optimally"]
+    assert last == pytest.approx(solved, abs=0.01)
+
+
+@pytest.mark.parametrize("place", ["profile.jpg", "taken.png", "nowhere/profile.png"])
+def test_profiles_are_pictures_of_their_own(tmp_path: Path, place: str) -> None:
+    (tmp_path / "taken.png").write_text("mine")
+    with pytest.raises(UsageError, match="--profile"):
+        main(CompareConfig(runs=(UCB, PLAN), profile=tmp_path / place))
+    assert (tmp_path / "taken.png").read_text() == "mine"
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from experiments.figures.curves import learning_curve, learning_curves, training_curve
+from experiments.figures.curves import (
+    learning_curve,
+    learning_curves,
+    performance_profiles,
+    training_curve,
+)
 from experiments.figures.glance import Glance, at_a_glance, look_of
 from experiments.figures.rollouts import (
     Play,
@@ -30,5 +35,6 @@ __all__ = [
     "learning_curves",
     "look_of",
     "method_styles",
+    "performance_profiles",
     "training_curve",
 ]

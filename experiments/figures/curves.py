@@ -1,4 +1,4 @@
-"""Figures of every world: curves of adaptation (figures 6 and 7 of the paper) and of training."""
+"""Figures of every world: curves of adaptation (figures 6 and 7 of the paper), profiles, and training."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from envs.drawing import INK
 from experiments.figures.style import METHODS, method_styles, plain, styled
+from experiments.store.statistics import performance_profile
 
 if TYPE_CHECKING:
     from experiments.store.results import Results
@@ -68,6 +69,43 @@ def _draw_curves(ax: Any, results: Mapping[str, Results], title: str | None) -> 
     ax.set(xlabel="episodes", ylabel="return of the optimized prompt", title=plain(title or ""))
     ax.set_xlim(left=0)
     ax.margins(y=0.08)
+
+
+@styled
+def performance_profiles(results: Mapping[str, Results], title: str | None = None) -> Figure:
+    """The share of tasks and seeds in which the optimized prompt is at least so good, for every "so good".
+
+    A performance profile (Agarwal et al., 2021): where one line is above another everywhere, its method is
+    the better one whatever mean is taken. Where optima are known the scale is the regret, which can be
+    compared between tasks, from bad to good; elsewhere it is the return. Bands are intervals of 95 %.
+    """
+    figure = Figure(figsize=(4.8, 2.7), layout="constrained")
+    ax = figure.add_subplot()
+    # A regret, negated: like a return it is the better the higher it is.
+    optima = [np.asarray(result.optimal_returns) for result in results.values()]
+    known = all(np.isfinite(optimum).all() for optimum in optima)
+    scores = [
+        result.eval_returns[:, :, -1] - (optimum if known else 0.0)
+        for result, optimum in zip(results.values(), optima, strict=True)
+    ]
+    low, high = (pick(pick(of_run) for of_run in map(np.ravel, scores)) for pick in (min, max))
+    edge = 0.02 * (high - low) or 0.02
+    thresholds = np.linspace(low - edge, high, 400, endpoint=False)
+    for score, look in zip(scores, method_styles(results).values(), strict=True):
+        share, lower, upper = performance_profile(score, thresholds)
+        ax.plot(thresholds, share, label=look.name, color=look.color, linestyle=look.line)
+        if lower is not None and upper is not None:
+            ax.fill_between(thresholds, lower, upper, color=look.color, alpha=0.16, linewidth=0)
+    if known:
+        ax.xaxis.set_major_formatter(lambda value, _: f"{abs(value):g}")
+    ax.set(
+        xlabel="regret of at most" if known else "return of at least",
+        ylabel="share of tasks and seeds",
+        title=plain(title or ""),
+        ylim=(-0.02, 1.02),
+    )
+    figure.legend(loc="outside right upper")
+    return figure
 
 
 @styled

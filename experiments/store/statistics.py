@@ -181,6 +181,42 @@ def paired_difference(
     )
 
 
+class Profile(NamedTuple):
+    """Shares of tasks and seeds whose score reaches each of K thresholds, with an interval at each."""
+
+    share: np.ndarray
+    """[K]."""
+    low: np.ndarray | None
+    """[K]; None with one seed."""
+    high: np.ndarray | None
+    """[K]; None with one seed."""
+
+
+def performance_profile(
+    scores: np.ndarray,
+    thresholds: np.ndarray,
+    confidence: float = 0.95,
+    num_resamples: int = 1000,
+    seed: int = 0,
+) -> Profile:
+    """Shares of the scores [S, N] that are at least each of the thresholds [K].
+
+    The intervals hold for each threshold by itself. Seeds are drawn anew within each task.
+    """
+
+    def shares(drawn: np.ndarray) -> np.ndarray:
+        below = np.searchsorted(np.sort(drawn, axis=None), thresholds, side="left")
+        return 1.0 - below / drawn.size
+
+    if len(scores) < 2:
+        return Profile(shares(scores), None, None)
+    rng = np.random.default_rng(seed)
+    resamples = [shares(_resampled(scores, rng)) for _ in range(num_resamples)]
+    tail = 50 * (1 - confidence)
+    low, high = np.percentile(resamples, [tail, 100 - tail], axis=0)
+    return Profile(shares(scores), low, high)
+
+
 def gain_over_tasks(
     a: np.ndarray,
     b: np.ndarray,

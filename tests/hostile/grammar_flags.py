@@ -160,6 +160,8 @@ CONTRADICTIONS: dict[str, tuple[tuple[str, str], ...]] = {
         ("nowhere result", "nowhere"),
         ("policy result", "policy"),
         ("--csv nowhere/new.csv", "nowhere"),
+        ("--profile new.jpg", ".png"),
+        ("--profile nowhere/new.png", "nowhere"),
     ),
     "plot": (
         ("--seed 1", "--seed"),
