@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from mgpo_jax.journal import Journal
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.runner import Outcome, sweep
 from mgpo_jax.schema import Json, read_document
+from mgpo_jax.seen_goals import warning_of_goals, warning_of_prompts
 from mgpo_jax.tasks import evaluation_tasks, load_tasks, task_arrays, test_tasks
 
 
@@ -88,6 +90,23 @@ ADDED = ("obs_noise", "action_noise", "stop_at")
 """Settings that count where they are given: work that was begun before there were these goes on."""
 
 
+def warn_of_goals(env: Environment, policy: LoadedPolicy, tasks: Task) -> None:
+    """Say on stderr if task goals lie far from the goals that the policy was trained on."""
+    goals = np.asarray(jax.vmap(env.task_goal)(tasks))
+    if text := warning_of_goals(policy.seen_goals, goals, "task goals"):
+        print(f"warning: {text}", file=sys.stderr)
+
+
+def warn_of_prompts(policy: LoadedPolicy, results: Results) -> None:
+    """Say on stderr if optimized prompts have goals far from those that the policy was trained on."""
+    best = results.best
+    if "prompt.goals" not in best:  # the method has no prompts
+        return
+    goals, mask = (best[name][:, :, -1] for name in ("prompt.goals", "prompt.mask"))
+    if text := warning_of_prompts(policy.seen_goals, goals, mask, "optimized prompts"):
+        print(f"warning: {text}", file=sys.stderr)
+
+
 def deciding(config: AdaptConfig, policy: LoadedPolicy, tasks: Task) -> dict[str, Any]:
     """Everything that decides about the results of an adaptation, as JSON values."""
     settings = {k: v for k, v in to_json(config).items() if k not in NOT_DECIDING}
@@ -135,12 +154,15 @@ def adapt_and_save(
       DataError: if the folder exists, another process makes it, or a return is not finite.
     """
     settings = deciding(config, policy, tasks)
+    if processes.is_first():
+        warn_of_goals(env, policy, tasks)
     with long_work(folder, settings, provenance(), config.resume) as work:
         (outcome,) = adapt_all(world, env, policy, tasks, [config], work.journal)
         if not processes.is_first():
             return None
         results = results_with_summary(config, env, policy, tasks, outcome)
         write_results(work.place, results, folder, work.meta)
+    warn_of_prompts(policy, results)
     return results
 
 

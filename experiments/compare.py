@@ -27,7 +27,7 @@ class CompareConfig(Common):
     csv: Path | None = None
     """File to write the return of each task and run to, as comma-separated values."""
     profile: Path | None = None
-    """Picture to draw (.png): the share of tasks in which a run is at least so good, for every "so good"."""
+    """Picture to draw (.png): the share of tasks in which a run is at least so good, for each "so good"."""
 
 
 def main(config: CompareConfig) -> None:

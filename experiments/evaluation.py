@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -27,6 +28,7 @@ from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.progress import Progress
 from mgpo_jax.prompts import Prompt
 from mgpo_jax.runner import evaluate_fully
+from mgpo_jax.seen_goals import warning_of_prompts
 from mgpo_jax.tasks import tasks_from
 
 OFFICIAL: Literal["official"] = "official"
@@ -177,7 +179,11 @@ def _evaluate_case(case: Case, episodes: int, seed: int) -> Iterator[dict[str, A
     result = case.result
     last = (slice(None), slice(None), -1)
     parts = (jnp.asarray(result.best[name][last]) for name in ("prompt.goals", "prompt.mask"))
-    queries = judged_query(Prompt(*parts), case.world.judged)
+    prompts = Prompt(*parts)
+    said = warning_of_prompts(case.policy.seen_goals, *prompts, f"prompts of {case.folder}")
+    if said and processes.is_first():
+        print(f"warning: {said}", file=sys.stderr)
+    queries = judged_query(prompts, case.world.judged)
     before = seed_spread(result.eval_returns[last])
     for noise, env in case.behind:
         judged = evaluate_fully(env, case.policy, case.tasks, queries, episodes=episodes, seed=seed)

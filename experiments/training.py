@@ -57,6 +57,7 @@ from mgpo_jax.prompts import Prompt, sample_prompt, single_goal
 from mgpo_jax.rollout import rollout
 from mgpo_jax.runner import together
 from mgpo_jax.schema import let_go
+from mgpo_jax.seen_goals import seen_in
 from mgpo_jax.settings import TrainConfig
 from mgpo_jax.sharding import device_mesh, devices_for, fetch
 from mgpo_jax.tasks import EVAL_SEED, evaluation_tasks
@@ -434,7 +435,8 @@ def _train_and_save(run: Run, go_on: str) -> None:
             state = _take_steps(run, before, metrics, manager, stopping, go_on)
     made = {"env": config.env, "config": to_json(config), "steps": state.step, **run.origin}
     policy = folder / runs.POLICY
-    save_policy(policy, run.network, state.params, made)
+    seen = seen_in(run.fit).joined(run.init.seen_goals if run.init else None)
+    save_policy(policy, run.network, state.params, made, seen)
     with written(folder / runs.PICTURE) as picture:
         training_curve(metrics.rows).savefig(picture)
     print(f"policy written to {policy}", file=sys.stderr)

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from envs.base import EnvSpec
 from envs.errors import DataError
+from mgpo_jax.seen_goals import SeenGoals
 from mgpo_jax.transformer import (
     GoalTransformer,
     NetworkConfig,
@@ -44,6 +45,8 @@ class LoadedPolicy(NamedTuple):
     """Of the file of weights; empty for weights that were never on disk."""
     folder: Path | None = None
     """Where it was read."""
+    seen_goals: SeenGoals | None = None
+    """The goals it was trained on; None for a policy that did not keep them."""
 
     @property
     def policy(self) -> Policy:

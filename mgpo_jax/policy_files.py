@@ -1,7 +1,8 @@
 """Policies on disk: one small file of weights and a config.
 
 The folder of a policy holds ``weights.npz``, ``config.json`` (what the network is, the hash of
-the weights, how they were made) and, beside them, whatever the release adds.
+the weights, how they were made), ``goals.npz`` (a sample of the goals of the training) and, beside them,
+whatever the release adds.
 """
 
 from __future__ import annotations
@@ -50,12 +51,14 @@ from mgpo_jax.schema import (
     read_arrays,
     read_document,
 )
+from mgpo_jax.seen_goals import MOST_KEPT, SeenGoals
 from mgpo_jax.settings import ENCODERS, Index
 from mgpo_jax.transformer import NetworkConfig, TransformerConfig
 
 FORMAT = 2  # 1 had flat observations of size obs_dim
 WEIGHTS = "weights.npz"
 CONFIG = "config.json"
+GOALS = "goals.npz"  # of the training
 BEFORE = "before"  # the folder of the old policy for the moment in which the new one takes its name
 MEND = "give the folder of another policy, or train it again"
 DTYPES = (
@@ -65,7 +68,13 @@ DTYPES = (
 """The dtypes that observations may have."""
 
 
-def save_policy(folder: Path, config: NetworkConfig, params: Any, made: dict[str, Any]) -> None:
+def save_policy(
+    folder: Path,
+    config: NetworkConfig,
+    params: Any,
+    made: dict[str, Any],
+    seen_goals: SeenGoals | None = None,
+) -> None:
     """Write a policy, which replaces one that is there; other files beside that one stay.
 
     However the process ends, the folder holds the old policy or the new one, whole.
@@ -75,12 +84,14 @@ def save_policy(folder: Path, config: NetworkConfig, params: Any, made: dict[str
       config: the network.
       params: its weights.
       made: how it was made (environment, command, results).
+      seen_goals: the goals of its training.
 
     Raises:
       DataError: if a weight is not finite.
     """
     folder = Path(folder)
     arrays = {name: np.asarray(leaf) for name, leaf in flatten_dict(params, sep="/").items()}
+    files = _Files(arrays, seen_goals)
     for name, array in arrays.items():
         if not np.isfinite(array).all():
             raise DataError(f"{folder} is not written: weight {name} holds NaN or infinity")
@@ -89,13 +100,20 @@ def save_policy(folder: Path, config: NetworkConfig, params: Any, made: dict[str
         document["kind"] = kind
     _finish_exchange(folder)
     if folder.is_dir():
-        _exchange(folder.resolve(), arrays, document)
+        _exchange(folder.resolve(), files, document)
     else:
         with new_folder(folder) as place:
-            _write_policy(place, arrays, document)
+            _write_policy(place, files, document)
 
 
-def _exchange(folder: Path, arrays: Mapping[str, np.ndarray], document: Mapping[str, Any]) -> None:
+class _Files(NamedTuple):
+    """What the npz files of a policy hold."""
+
+    weights: Mapping[str, np.ndarray]
+    seen_goals: SeenGoals | None
+
+
+def _exchange(folder: Path, files: _Files, document: Mapping[str, Any]) -> None:
     """Write a policy beside the folder of another one, with what else lies there, and exchange the two."""
     partial = partial_name(folder)
     with claimed(partial):
@@ -104,9 +122,9 @@ def _exchange(folder: Path, arrays: Mapping[str, np.ndarray], document: Mapping[
         clear()
         try:
             with cleaned_on_exit(clear):
-                other_files = shutil.ignore_patterns(WEIGHTS, CONFIG, f"{TEMPORARY}*")
+                other_files = shutil.ignore_patterns(WEIGHTS, CONFIG, GOALS, f"{TEMPORARY}*")
                 shutil.copytree(folder, place, symlinks=True, ignore=other_files)
-                _write_policy(place, arrays, document)
+                _write_policy(place, files, document)
             os.rename(folder, before)
             os.rename(place, folder)
         except BaseException:
@@ -133,10 +151,10 @@ def _put_back(before: Path, folder: Path) -> None:
         os.rename(before, folder)
 
 
-def _write_policy(
-    folder: Path, arrays: Mapping[str, np.ndarray], document: Mapping[str, Any]
-) -> None:
-    write_arrays(folder / WEIGHTS, arrays, compressed=False)
+def _write_policy(folder: Path, files: _Files, document: Mapping[str, Any]) -> None:
+    write_arrays(folder / WEIGHTS, files.weights, compressed=False)
+    if files.seen_goals is not None:
+        write_seen_goals(folder, files.seen_goals)
     write_json(folder / CONFIG, {**document, "sha256": hash_file(folder / WEIGHTS)})
 
 
@@ -214,7 +232,36 @@ def read_policy(folder: Path, spec: EnvSpec | None = None, kind: str = MULTI_GOA
     if spec is not None:
         check_fits(network, spec, f"the policy in {folder}")
     params = jax.tree.map(jnp.asarray, unflatten_dict(flat, sep="/"))
-    return LoadedPolicy(network, params, document.made, document.sha256, folder)
+    seen = read_seen_goals(folder)
+    if seen is not None and seen.goals.shape[1] != network.goal_dim:
+        raise DataError(
+            f"{folder / GOALS} has goals of {seen.goals.shape[1]} numbers, the policy beside it takes "
+            f"{network.goal_dim}; remove the file, or {MEND}"
+        )
+    return LoadedPolicy(network, params, document.made, document.sha256, folder, seen)
+
+
+def write_seen_goals(folder: Path, seen: SeenGoals) -> None:
+    """Write the goals that a policy was trained on into its folder."""
+    arrays = {"goals": seen.goals, "reach": np.asarray(seen.reach, np.float32)}
+    write_arrays(Path(folder) / GOALS, arrays)
+
+
+def read_seen_goals(folder: Path) -> SeenGoals | None:
+    """The goals that the policy in a folder was trained on; None if they were not kept.
+
+    Raises:
+      DataError: if the file is damaged.
+    """
+    path = Path(folder) / GOALS
+    if not path.is_file():
+        return None
+    fields = {
+        "goals": ArrayField(("K", "G"), "float32"),
+        "reach": ArrayField((), "float32", low=0),
+    }
+    arrays = read_arrays(path, fields, {"K": range(1, MOST_KEPT + 1)}, f"remove it, or {MEND}")
+    return SeenGoals(arrays["goals"], float(arrays["reach"]))
 
 
 class _Document(BaseModel):

@@ -29,6 +29,7 @@ from mgpo_jax.kinds import Learned, kind_of
 from mgpo_jax.policy import LoadedPolicy, check_fits
 from mgpo_jax.progress import Progress
 from mgpo_jax.prompts import hindsight_outcome, sample_prompt, single_goal
+from mgpo_jax.seen_goals import seen_in
 from mgpo_jax.settings import (
     RECIPE_NETWORK,
     TrainConfig,
@@ -573,4 +574,5 @@ def pretrain(
     made: dict[str, Any] = {"steps": config.steps}
     if init is not None and init.sha256:
         made["init_sha256"] = init.sha256
-    return LoadedPolicy(sizes, state.params, made)
+    seen = seen_in(dataset).joined(init.seen_goals if init else None)
+    return LoadedPolicy(sizes, state.params, made, seen_goals=seen)

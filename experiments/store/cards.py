@@ -21,7 +21,7 @@ from mgpo_jax.dataset import variant_counts
 from mgpo_jax.files import new_folder, write_text
 from mgpo_jax.kinds import MULTI_GOAL, Kind, kind_of
 from mgpo_jax.policy import LoadedPolicy, check_fits
-from mgpo_jax.policy_files import CONFIG, WEIGHTS, read_policy
+from mgpo_jax.policy_files import CONFIG, GOALS, WEIGHTS, read_policy
 from mgpo_jax.released import released_folder
 from mgpo_jax.tasks import benchmark_tasks, save_tasks
 from mgpo_jax.training import HIT
@@ -43,7 +43,7 @@ Made by
 
 ![loss and {acting} returns while training](training.png)
 
-Files: `weights.npz`, `config.json` (network, SHA-256 of the weights, all settings), {tasks}`metrics.jsonl`.
+Files: `weights.npz`, `config.json` (network, SHA-256 of the weights, all settings), {files}`metrics.jsonl`.
 Results {where} are in `results/` and the README.
 """
 
@@ -137,12 +137,19 @@ def card(run: Finished) -> str:
         else ""
     )
     tested = run.kind.name == MULTI_GOAL
+    tasks = "`tasks.npz` (the\ntest tasks, in no dataset), " if tested else ""
+    goals = (
+        "`goals.npz`\n(a sample of the goals of the training), " if run.policy.seen_goals else ""
+    )
     return CARD.format(
         title=run.kind.title,
         env=settings.env,
         facts="\n".join(f"| {name} | {text} |" for name, text in facts.items()),
         watched=run.kind.watched,
-        tasks="`tasks.npz` (the\ntest tasks, in no dataset), " if tested else "",
+        files=goals + tasks,
+        goals=", `goals.npz` (a sample of the goals\nof the training)"
+        if run.policy.seen_goals
+        else "",
         where="on them" if tested else "of the methods that use it",
         trajectories=settings.data.trajectories,
         demonstrator=find_demonstrator(run.world, env, settings.data.demonstrator)[0],
@@ -203,8 +210,9 @@ def _origin(place: Path, made: Mapping[str, Any]) -> str:
 def release(run: Finished, folder: Path) -> None:
     """Write the released form of a run to a new folder, which appears when all of it is there."""
     with new_folder(folder) as place:
-        for name in (WEIGHTS, CONFIG):
-            shutil.copy(run.source / "policy" / name, place / name)
+        for name in (WEIGHTS, CONFIG, GOALS):
+            if (run.source / "policy" / name).is_file():  # an older run kept no goals
+                shutil.copy(run.source / "policy" / name, place / name)
         shutil.copy(run.source / METRICS, place)
         training_curve(run.rows).savefig(place / "training.png")
         if run.kind.name == MULTI_GOAL:

@@ -147,7 +147,9 @@ def keep_initial(config: PretrainConfig, meta: Mapping[str, Any]) -> None:
         raise DataError(f"{place} is no folder; remove it, and --init is read again")
     place.mkdir(exist_ok=True)
     remove_unfinished(place)
-    for name in (WEIGHTS, CONFIG):
+    for name in (WEIGHTS, CONFIG, GOALS):
+        if name == GOALS and not (source / name).is_file():
+            continue  # an older policy kept no goals
         with written(place / name) as partial:
             shutil.copyfile(source / name, partial)
     if hash_file(place / WEIGHTS) != meta["init_sha256"]:
