@@ -17,7 +17,7 @@ from envs.registry import World
 from experiments.joining import OF_PROCESSES
 from experiments.runtime import expect_compiling
 from experiments.store.layout import META
-from experiments.store.policies import check_weights
+from experiments.store.policies import check_weights, far_prompts
 from experiments.store.provenance import provenance
 from experiments.store.results import Results, load_results, results_of, write_results
 from experiments.store.runs import changes
@@ -30,7 +30,7 @@ from mgpo_jax.journal import Journal
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.runner import Outcome, sweep
 from mgpo_jax.schema import Json, read_document
-from mgpo_jax.seen_goals import warning_of_goals, warning_of_prompts
+from mgpo_jax.seen_goals import warning_of_goals
 from mgpo_jax.tasks import evaluation_tasks, load_tasks, task_arrays, test_tasks
 
 
@@ -97,16 +97,6 @@ def warn_of_goals(env: Environment, policy: LoadedPolicy, tasks: Task) -> None:
         print(f"warning: {text}", file=sys.stderr)
 
 
-def warn_of_prompts(policy: LoadedPolicy, results: Results) -> None:
-    """Say on stderr if optimized prompts have goals far from those that the policy was trained on."""
-    best = results.best
-    if "prompt.goals" not in best:  # the method has no prompts
-        return
-    goals, mask = (best[name][:, :, -1] for name in ("prompt.goals", "prompt.mask"))
-    if text := warning_of_prompts(policy.seen_goals, goals, mask, "optimized prompts"):
-        print(f"warning: {text}", file=sys.stderr)
-
-
 def deciding(config: AdaptConfig, policy: LoadedPolicy, tasks: Task) -> dict[str, Any]:
     """Everything that decides about the results of an adaptation, as JSON values."""
     settings = {k: v for k, v in to_json(config).items() if k not in NOT_DECIDING}
@@ -162,7 +152,8 @@ def adapt_and_save(
             return None
         results = results_with_summary(config, env, policy, tasks, outcome)
         write_results(work.place, results, folder, work.meta)
-    warn_of_prompts(policy, results)
+    if text := far_prompts(results):
+        print(f"warning: {text}", file=sys.stderr)
     return results
 
 

@@ -42,6 +42,9 @@ EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
 NEWS = 3.0
 """Seconds after an error of one of several processes in which news may come that another is to blame."""
 
+LEAST_COMPILED = 0.01
+"""Seconds of compiling from which a program is kept: a command has dozens of small ones."""
+
 # mallopt parameters of the GNU C library
 M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -2, -3, -8
 
@@ -83,12 +86,12 @@ def configure() -> None:
         return
     warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation")
     os.environ["JAX_COMPILATION_CACHE_DIR"] = cache
-    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.5"
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = str(LEAST_COMPILED)
     if "jax" in sys.modules:  # as above
         import jax
 
         jax.config.update("jax_compilation_cache_dir", cache)
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", LEAST_COMPILED)
 
 
 def cache_folder() -> str:

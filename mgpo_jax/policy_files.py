@@ -241,6 +241,15 @@ def read_policy(folder: Path, spec: EnvSpec | None = None, kind: str = MULTI_GOA
     return LoadedPolicy(network, params, document.made, document.sha256, folder, seen)
 
 
+def hash_in_config(folder: Path) -> str | None:
+    """The hash of the weights that the config of a policy names; None where there is no config.
+
+    Raises:
+      DataError: if the config is damaged.
+    """
+    return _read_config(Path(folder)).sha256 if (Path(folder) / CONFIG).is_file() else None
+
+
 def write_seen_goals(folder: Path, seen: SeenGoals) -> None:
     """Write the goals that a policy was trained on into its folder."""
     arrays = {"goals": seen.goals, "reach": np.asarray(seen.reach, np.float32)}

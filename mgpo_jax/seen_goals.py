@@ -49,7 +49,10 @@ class SeenGoals(NamedTuple):
 
 
 def seen_in(dataset: Dataset) -> SeenGoals:
-    """The goals that the trajectories of a dataset achieved, of 5,000 of them where there are more."""
+    """The goals that prompts of a dataset can hold, those of 5,000 trajectories where there are more.
+
+    Those are the goals reached on the way, and the task goals that a trajectory accomplished in hindsight.
+    """
     rng = np.random.default_rng(SEED)
     which = np.arange(len(dataset))
     if len(which) > MOST_TRAJECTORIES:
@@ -58,8 +61,9 @@ def seen_in(dataset: Dataset) -> SeenGoals:
     found: list[np.ndarray] = []
     for piece in np.array_split(which, max(1, len(which) // 500)):
         steps = [slice(starts[i], starts[i] + dataset.lengths[i]) for i in piece]
-        goals = np.concatenate([dataset.achieved_goals[s] for s in steps])
-        found.append(np.unique(goals, axis=0))
+        reached = [dataset.achieved_goals[s][dataset.goal_reached[s]] for s in steps]
+        accomplished = [dataset.outcomes[s] for s in steps]
+        found.append(np.unique(np.concatenate([*reached, *accomplished]), axis=0))
     return covering(np.unique(np.concatenate(found), axis=0))
 
 

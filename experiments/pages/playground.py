@@ -16,6 +16,7 @@ from experiments.pages.packing import packed
 from experiments.pages.worlds import page_of, tasks_in_page
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.policy_files import load_policy
+from mgpo_jax.seen_goals import SeenGoals
 from mgpo_jax.tasks import test_tasks
 
 ENTRY = SCRIPTS / "playground.js"
@@ -58,11 +59,17 @@ def world_data(world: World, policy: LoadedPolicy) -> dict[str, Any]:
         "tasks": tasks_in_page(page, test_tasks(world)),
         "network": {name: getattr(network, name) for name in NETWORK},
         "weights": packed(half_weights(policy)),
+        "seen": _seen(policy.seen_goals),
         "sha256": policy.sha256,
         "returnSpan": spec.return_range[1] - spec.return_range[0],
         "deterministic": spec.deterministic,
         "keepRewarded": spec.reward_confirms_goals,
     }
+
+
+def _seen(seen: SeenGoals | None) -> dict[str, Any] | None:
+    """The goals of the training as JSON values."""
+    return seen and {"goals": packed({"goals": seen.goals}), "reach": seen.reach}
 
 
 def half_weights(policy: LoadedPolicy) -> dict[str, np.ndarray]:

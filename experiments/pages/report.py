@@ -25,6 +25,7 @@ from experiments.pages.tracks import tracks_of
 from experiments.pages.worlds import page_of, tasks_in_page
 from experiments.store.layout import META
 from experiments.store.paper import paper_final
+from experiments.store.policies import far_prompts, seen_goals_of
 from experiments.store.provenance import read_meta
 from experiments.store.results import Results, load_results
 from experiments.store.rows import Row, read_row
@@ -148,6 +149,7 @@ def _facts(results: Results, row: Row) -> list[tuple[str, str]]:
         ("unsolvable tasks", str(unsolvable) if unsolvable else ""),
         ("parts in order", ", ".join(shares)),
         ("paper: final", paper),
+        ("far from training", far_prompts(results)),
         ("weights", (summary.get("policy_sha256") or "")[:12]),
         ("command", " ".join(meta.command)),
         ("revision", meta.revision),
@@ -191,6 +193,8 @@ def _arrays_of(results: Results, page: Page, with_episodes: bool) -> dict[str, n
         goals.append(reached.goals)
     table, index = np.unique(np.concatenate(goals), axis=0, return_inverse=True)
     arrays["goals"] = table.astype(np.float32)
+    if (seen := seen_goals_of(results)) is not None:
+        arrays["far"] = seen.far(table).astype(np.uint8)
     parts = np.split(index.ravel(), np.cumsum([len(part) for part in goals])[:-1])[1:]
     if "prompt.goals" in results.choices:
         arrays |= _prompts(results, parts[:2])

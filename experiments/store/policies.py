@@ -12,8 +12,9 @@ from experiments.store.results import Results
 from experiments.store.summary import ADAPT_AGAIN
 from mgpo_jax.methods import policy_kind
 from mgpo_jax.policy import LoadedPolicy
-from mgpo_jax.policy_files import CONFIG, load_policy
+from mgpo_jax.policy_files import CONFIG, hash_in_config, load_policy, read_seen_goals
 from mgpo_jax.released import released_folder
+from mgpo_jax.seen_goals import SeenGoals, warning_of_prompts
 
 GIVE = "give the folder of the one that they were made with by --policy"
 
@@ -53,6 +54,26 @@ def places_of_policy(results: Results) -> list[Path]:
         return [released_folder(results.world, policy_kind(results.method))]
     noted = [] if folder is None else read_meta(folder / META, ADAPT_AGAIN).policy_places
     return list(dict.fromkeys([*(Path(folder or "", place) for place in noted), Path(policy)]))
+
+
+def seen_goals_of(results: Results) -> SeenGoals | None:
+    """The goals that the policy of an adaptation was trained on, where it still lies; None if not known."""
+    made_with = results.summary.get("policy_sha256")
+    for place in places_of_policy(results):
+        try:
+            if made_with and hash_in_config(place) == made_with:
+                return read_seen_goals(place)
+        except DataError:  # a damaged policy takes no report away
+            continue
+    return None
+
+
+def far_prompts(results: Results) -> str:
+    """A sentence on optimized prompts with goals far from the training; empty if there are none."""
+    if "prompt.goals" not in results.best:  # the method has no prompts
+        return ""
+    goals, mask = (results.best[name][:, :, -1] for name in ("prompt.goals", "prompt.mask"))
+    return warning_of_prompts(seen_goals_of(results), goals, mask, "optimized prompts")
 
 
 def check_weights(results: Results, policy: LoadedPolicy, mend: str) -> None:

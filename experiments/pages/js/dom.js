@@ -37,6 +37,18 @@ export function fill(parent, ...children) {
   parent.replaceChildren(...children.filter(Boolean).map((child) => /** @type {string | Node} */ (child)));
 }
 
+/**
+ * The goals of a prompt, numbered, with a mark on those far from all goals of the training.
+ * @param {Element} parent @param {string[]} names @param {boolean[]} far
+ */
+export function showPrompt(parent, names, far) {
+  fill(parent, ...names.map((name, i) => {
+    const kind = ["chip", i === names.length - 1 && "last", far[i] && "far"].filter(Boolean).join(" ");
+    const title = far[i] ? "far from all goals that the policy was trained on" : null;
+    return element("span", { class: kind, title }, element("b", {}, String(i + 1)), name, far[i] && element("em", {}, "far"));
+  }));
+}
+
 /** The colors of the drawing in the page's present scheme. @returns {Colors} */
 export function colorsOf() {
   const style = getComputedStyle(document.documentElement);

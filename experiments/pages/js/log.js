@@ -60,11 +60,21 @@ export class Log {
     return mean(range(this.numSeeds).map((seed) => this.judged(seed, task, judgement)));
   }
 
+  /** The places of the goals of row `index` of the table of prompts in the table of goals. @param {number} index @returns {number[]} */
+  places(index) {
+    const { data, shape: [, slots] } = this.arrays.prompts;
+    return Array.from(data.slice(index * slots, (index + 1) * slots), (/** @type {number} */ place) => place - 1).filter((place) => place >= 0);
+  }
+
   /** The goals of row `index` of the table of prompts. @param {number} index @returns {Goal[]} */
   prompt(index) {
-    const { prompts, goals } = this.arrays, slots = prompts.shape[1], size = goals.shape[1];
-    const places = Array.from(prompts.data.slice(index * slots, (index + 1) * slots), (place) => place - 1);
-    return places.filter((place) => place >= 0).map((place) => goals.data.slice(place * size, (place + 1) * size));
+    const { data, shape: [, size] } = this.arrays.goals;
+    return this.places(index).map((place) => data.slice(place * size, (place + 1) * size));
+  }
+
+  /** Which goals of a row of the table of prompts are far from the goals of the training. @param {number} index @returns {boolean[]} */
+  isFar(index) {
+    return this.places(index).map((place) => Boolean(this.arrays.far?.data[place]));
   }
 
   /** @param {"choice" | "best" | "greedy"} name @param {number} seed @param {number} task @param {number} episode @returns {number} */

@@ -3,12 +3,13 @@
 import { unpack } from "./arrays.js";
 import { curves } from "./chart.js";
 import { Policy, argmax, softmax } from "./decoder.js";
-import { byId, drawScene, element, fill, legendOf, onScheme, spotAt } from "./dom.js";
+import { byId, drawScene, element, fill, legendOf, onScheme, showPrompt, spotAt } from "./dom.js";
 import { Chance, Search, runEpisode, sampled } from "./search.js";
+import { farFrom } from "./seen.js";
 
 /**
  * @typedef {{ name: string, summary: string, facts: any, tasks: { task: any, text: string }[], network: import("./decoder.js").Network,
- *   weights: import("./arrays.js").Packed, sha256: string, returnSpan: number, deterministic: boolean, keepRewarded: boolean }} WorldData
+ *   weights: import("./arrays.js").Packed, seen: import("./seen.js").SeenData | null, sha256: string, returnSpan: number, deterministic: boolean, keepRewarded: boolean }} WorldData
  */
 
 const NUM_EPISODES = 100;
@@ -20,11 +21,12 @@ const breathe = () => new Promise((resolve) => setTimeout(resolve));
 
 /** One world with its policy, its task and the episode in progress. */
 class Stage {
-  /** @param {WorldPage} world @param {WorldData} data @param {Policy} policy */
-  constructor(world, data, policy) {
+  /** @param {WorldPage} world @param {WorldData} data @param {Policy} policy @param {(goal: Goal) => boolean} isFar */
+  constructor(world, data, policy, isFar) {
     this.world = world;
     this.data = data;
     this.policy = policy;
+    this.isFar = isFar;
     /** @type {Goal[]} */
     this.waypoints = [];
     /** @type {any} */
@@ -310,8 +312,9 @@ class Playground {
     drawScene(byId("stage"), world, data.facts, {
       task: stage.task, goals, moments: stage.moments, onlySeen: byId("seen").checked, cursor: this.hasFocus ? stage.cursor : null,
     });
-    fill(byId("chips"), ...goals.map((goal, i) =>
-      element("span", { class: i === goals.length - 1 ? "chip last" : "chip" }, element("b", {}, String(i + 1)), world.goalName(data.facts, goal))));
+    const far = goals.map(stage.isFar);
+    showPrompt(byId("chips"), goals.map((goal) => world.goalName(data.facts, goal)), far);
+    byId("far").hidden = !far.includes(true);
     byId("prompt-text").textContent = `Prompt: up to ${data.network.max_prompt_length - 1} goals of yours, then the task goal`;
     byId("undo").disabled = byId("clear").disabled = !stage.waypoints.length;
     const share = softmax(stage.logits), likeliest = argmax(share);
@@ -337,7 +340,7 @@ class Playground {
 export async function main(worlds, data) {
   const stageOf = async (/** @type {number} */ i) => {
     const of = data.worlds[i];
-    return new Stage(worlds[i], of, new Policy(of.network, await unpack(of.weights)));
+    return new Stage(worlds[i], of, new Policy(of.network, await unpack(of.weights)), await farFrom(of.seen));
   };
   await new Playground(data.worlds.map(({ name }) => name), stageOf).begin();
   document.body.dataset.ready = "yes";

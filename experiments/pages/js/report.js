@@ -2,7 +2,7 @@
 
 import { mean, range } from "./arrays.js";
 import { chartWidth, curves, scale, ticks } from "./chart.js";
-import { byId, drawScene, element, fill, legendOf, onScheme, svg } from "./dom.js";
+import { byId, drawScene, element, fill, legendOf, onScheme, showPrompt, svg } from "./dom.js";
 import { hasKnown, knownTitle, showKnown } from "./known.js";
 import { Log } from "./log.js";
 
@@ -22,12 +22,6 @@ function goalNamer(world, { facts, parts }) {
   if (parts.length)
     return (goal) => Array.from(goal).flatMap((value, i) => (value > 0.5 ? [parts[i] ?? String(i)] : [])).join(" + ") || "none";
   return (goal) => `(${Array.from(goal, (value) => Number(value.toFixed(2))).join(", ")})`;
-}
-
-/** The goals of a prompt, numbered. @param {HTMLElement} parent @param {Goal[]} goals @param {(goal: Goal) => string} name */
-function showPrompt(parent, goals, name) {
-  fill(parent, ...goals.map((goal, i) =>
-    element("span", { class: i === goals.length - 1 ? "chip last" : "chip" }, element("b", {}, String(i + 1)), name(goal))));
 }
 
 /** A table of facts, one column for each run. @param {Log[]} logs */
@@ -279,8 +273,10 @@ class Report {
     const greedy = log.hasPrompts ? (log.ofRound("greedy", seed, task, episode) ? "greedy actions" : "sampled actions") : "";
     byId("kind").textContent = [data.tasks[task].text, greedy, this.logs.length > 1 ? this.logs[run].data.label : ""].filter(Boolean).join("; ");
     if (log.hasPrompts) {
-      showPrompt(byId("chips"), log.prompt(log.ofRound("choice", seed, task, episode)), this.goalName);
-      showPrompt(byId("best"), log.prompt(log.ofRound("best", seed, task, episode)), this.goalName);
+      for (const [id, which] of /** @type {["chips" | "best", "choice" | "best"][]} */ ([["chips", "choice"], ["best", "best"]])) {
+        const prompt = log.ofRound(which, seed, task, episode);
+        showPrompt(byId(id), log.prompt(prompt).map(this.goalName), log.isFar(prompt));
+      }
     }
     fill(byId("returns"), this.returnsChart());
     this.draw();
