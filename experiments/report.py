@@ -26,6 +26,9 @@ class ReportConfig(Common):
     """Result folders of adaptations to the same tasks."""
     out: Path = Path("report.html")
     """HTML file to write; it needs no other file, no server and no network."""
+    pictures: tuple[Path, ...] = ()
+    """PNG and GIF files to show below, such as the video of a kitchen that `experiments.plot` makes. Those
+    videos that lie in the result folders are shown anyway."""
     env: Name | None = None
     """A world of your own that the results name, as module:attribute: files alone import nothing."""
 
@@ -38,7 +41,7 @@ def main(config: ReportConfig) -> None:
         envs.find(config.env)  # from now on results may name its place
     from experiments.pages.report import write_report
 
-    write_report(config.runs, config.out)
+    write_report(config.runs, config.out, config.pictures)
     print(printable(str(config.out)), file=sys.stderr)
 
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from made_results import TINY, made_results
+from PIL import Image
 
 from envs.errors import UsageError
 from envs.gridworld import GRIDWORLD
@@ -300,6 +301,40 @@ def test_runs_on_other_tasks_are_refused(tmp_path: Path, result: Path) -> None:
     other = saved(tmp_path / "other", made_results(tasks=changed, config=config_of("tiny")))
     with pytest.raises(UsageError, match="ran on different tasks"):
         report([result, other])
+
+
+def test_pictures_and_videos_stand_below(tmp_path: Path, result: Path) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(result, folder)
+    image = Image.new("RGB", (4, 3), "red")
+    image.save(folder / "task_0.gif", save_all=True, append_images=[Image.new("RGB", (4, 3))])
+    image.save(tmp_path / "<b>.png")
+    page = report([folder], [tmp_path / "<b>.png"])
+    assert "<b>.png" not in page
+    shown = data_of(page)["pictures"]
+    assert [picture["name"] for picture in shown] == ["<b>", "task 0"]
+    head, _, content = shown[1]["source"].partition(",")
+    assert head == "data:image/gif;base64"
+    assert base64.b64decode(content) == (folder / "task_0.gif").read_bytes()
+    assert data_of(report([result]))["pictures"] == []
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("a.png", b"<svg>", "is no picture that a page can show"),
+        ("a.svg", b"<svg>", "is no picture that a page can show"),
+        ("a.gif", b"GIF89a" + bytes(4_000_000), "4.0 MB, a page 5 MB at most"),
+        ("none.gif", None, "cannot be read: No such file"),
+    ],
+)
+def test_what_is_no_picture_is_refused(
+    tmp_path: Path, result: Path, name: str, content: bytes | None, says: str
+) -> None:
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(UsageError, match=says):
+        report([result], [tmp_path / name])
 
 
 def test_a_page_that_would_be_too_large_leaves_out_the_episodes(

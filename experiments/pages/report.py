@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -38,11 +39,13 @@ ENTRY = SCRIPTS / "report.js"
 REPORT = "report.html"  # in the folder of an adaptation
 VERSIONS = ("python", "jax", "numpy")  # of what is in the head
 MOST_BYTES = 5_000_000  # of a page; a larger one leaves out what its episodes did
+PICTURES = {".gif": b"GIF8", ".png": b"\x89PNG"}
+"""The pictures that a page can hold, by the end of their names, with how their files begin."""
 
 
-def write_report(folders: Sequence[Path], out: Path) -> None:
+def write_report(folders: Sequence[Path], out: Path, pictures: Sequence[Path] = ()) -> None:
     """Write the page of some result folders, whole or not at all; see ``report``."""
-    page = report(folders)
+    page = report(folders, pictures)
     write_sealed(out, lambda path: path.write_text(page, encoding="utf-8"))
 
 
@@ -54,13 +57,15 @@ def report_of_run(folder: Path) -> None:
         print(printable(str(out)), file=sys.stderr)
 
 
-def report(folders: Sequence[Path]) -> str:
-    """The page of some result folders.
+def report(folders: Sequence[Path], pictures: Sequence[Path] = ()) -> str:
+    """The page of some result folders, with pictures and videos below, and those that lie in the folders.
 
     Raises:
-      UsageError: if they ran on different tasks.
+      UsageError: if they ran on different tasks, or a picture is none or too large.
       DataError: if a folder is damaged.
     """
+    videos = [path for folder in dict.fromkeys(folders) for path in sorted(folder.glob("*.gif"))]
+    shown = [_picture(path) for path in dict.fromkeys([*pictures, *videos])]
     found = {folder: load_results(folder) for folder in dict.fromkeys(folders)}
     rows = [read_row(folder) for folder in found]
     first_folder, first = next(iter(found.items()))
@@ -69,11 +74,33 @@ def report(folders: Sequence[Path]) -> str:
             raise UsageError(
                 f"{folder} and {first_folder} ran on different tasks; make a report of each by itself"
             )
-    data = report_data(found, rows)
+    data = {**report_data(found, rows), "pictures": shown}
     page = _page(data, first)
     if len(page) > MOST_BYTES:
-        page = _page(report_data(found, rows, with_episodes=False), first)
+        page = _page({**data, **report_data(found, rows, with_episodes=False)}, first)
     return page
+
+
+def _picture(path: Path) -> dict[str, str]:
+    """A picture or a video as a part of the page.
+
+    Raises:
+      UsageError: if it is no GIF or PNG, or does not fit into a page.
+    """
+    begins = PICTURES.get(path.suffix)
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise UsageError(f"the picture {path} cannot be read: {error.strerror}") from None
+    if begins is None or not content.startswith(begins):
+        raise UsageError(f"{path} is no picture that a page can show; those are GIF and PNG files")
+    source = f"data:image/{path.suffix[1:]};base64,{base64.b64encode(content).decode()}"
+    if len(source) > MOST_BYTES:
+        raise UsageError(
+            f"{path} has {len(content) / 1e6:.1f} MB, a page {MOST_BYTES / 1e6:.0f} MB at most; draw fewer "
+            "tasks or a shorter video"
+        )
+    return {"name": path.stem.replace("_", " "), "source": source}
 
 
 def _page(data: Mapping[str, Any], results: Results) -> str:

@@ -9,7 +9,7 @@ import { Log } from "./log.js";
 /**
  * @typedef {{ name: string, summary: string, facts: any, parts: string[] }} WorldData
  * @typedef {{ world: WorldData, tasks: { task: any, text: string }[], optimum: number[] | null, withEpisodes: boolean,
- *   runs: import("./log.js").RunData[] }} ReportData
+ *   pictures?: { name: string, source: string }[], runs: import("./log.js").RunData[] }} ReportData
  * @typedef {{ run: number, task: number, seed: number, episode: number }} Place episode counts from 0
  */
 
@@ -88,6 +88,7 @@ class Report {
     fill(byId("comparisons"), ...logs.slice(1).map((log) =>
       element("p", {}, `${log.data.label} minus ${logs[0].data.label}, paired by task, with 95 % intervals over seeds: ${log.data.comparison}.`)));
     this.drawCurves();
+    this.showPictures();
     this.prepareTasks();
     this.prepareViewer();
     this.go(this.fromAddress());
@@ -113,6 +114,13 @@ class Report {
         svg("line", { x1: 0, x2: 30, y1: 5, y2: 5, stroke: log.data.color, "stroke-width": 3, "stroke-dasharray": ["", "7 4", "2 3"][i % 3] || null }));
       return element("span", { class: "entry" }, line, log.data.label);
     }), element("span", { class: "entry" }, "bands: standard deviation over seeds"));
+  }
+
+  showPictures() {
+    const pictures = this.data.pictures ?? [];
+    byId("pictures-section").hidden = !pictures.length;
+    fill(byId("pictures"), ...pictures.map(({ name, source }) =>
+      element("figure", {}, element("img", { src: source, alt: name }), element("figcaption", { class: "quiet" }, name))));
   }
 
   /** What tasks can be sorted by. @returns {[string, (task: number) => number][]} */
