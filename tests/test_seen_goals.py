@@ -257,7 +257,7 @@ def test_commands_warn_of_goals_that_no_demonstration_reached(
     assert f"warning: 2 of 2 prompts of {out} lie far" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", ["maze15", "maze30", "gridworld", "crafter-symbolic"])
+@pytest.mark.parametrize("name", ["maze15", "maze30", "gridworld", "kitchen", "crafter-symbolic"])
 def test_released_policies_know_the_goals_of_their_tasks(name: str) -> None:
     policy, world = load_policy(name), envs.find(name)
     goals = np.asarray(jax.vmap(world.make().task_goal)(tasks_of.test_tasks(world)))
