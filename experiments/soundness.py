@@ -18,9 +18,9 @@ import numpy as np
 import envs
 from envs.base import EnvSpec
 from envs.errors import printable
+from mgpo_jax.archives import let_go
 from mgpo_jax.dataset import STEP_ARRAYS, Dataset, load_dataset
 from mgpo_jax.manifest import Facts, read_facts
-from mgpo_jax.schema import let_go
 
 SAMPLE = 20_000  # steps that the regressions look at
 MOST_NUMBERS = 256  # of an observation, for the regressions

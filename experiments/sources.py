@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from envs.errors import DataError, UsageError, printable, shown
-from mgpo_jax.schema import ArrayField, array_headers, read_arrays
+from mgpo_jax.archives import ArrayField, array_headers, read_arrays
 
 ACTIONS = ("actions", "action")
 TERMINATED = ("terminals", "terminations", "terminated")

@@ -36,6 +36,7 @@ from experiments.store.settings import (
 )
 from experiments.training_data import own_dataset, prepare_dataset
 from mgpo_jax import processes
+from mgpo_jax.archives import let_go
 from mgpo_jax.checkpoint import (
     Snapshot,
     checkpoints,
@@ -56,7 +57,6 @@ from mgpo_jax.progress import Progress
 from mgpo_jax.prompts import Prompt, sample_prompt, single_goal
 from mgpo_jax.rollout import rollout
 from mgpo_jax.runner import together
-from mgpo_jax.schema import let_go
 from mgpo_jax.seen_goals import seen_in
 from mgpo_jax.settings import TrainConfig
 from mgpo_jax.sharding import device_mesh, devices_for, fetch

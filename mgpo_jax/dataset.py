@@ -18,6 +18,7 @@ import numpy as np
 from envs.base import ArraySpec, Box, Discrete, EnvSpec, Trajectory
 from envs.errors import DataError, shown
 from envs.registry import WORLDS
+from mgpo_jax.archives import ArrayField, Sizes, fitted_arrays, let_go, mapped_arrays, read_arrays
 from mgpo_jax.files import hash_file, new_folder, write_arrays, write_json
 from mgpo_jax.manifest import (
     ARRAYS,
@@ -29,14 +30,6 @@ from mgpo_jax.manifest import (
     hash_of_files,
     mend_for,
     read_manifest,
-)
-from mgpo_jax.schema import (
-    ArrayField,
-    Sizes,
-    fitted_arrays,
-    let_go,
-    mapped_arrays,
-    read_arrays,
 )
 
 SIZES: Sizes = {"trajectory": range(1, 2**31), "step": range(1, 2**31)}

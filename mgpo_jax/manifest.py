@@ -18,19 +18,21 @@ from annotated_types import Ge, Le, MaxLen
 from pydantic import BaseModel
 
 from envs.errors import DataError
-from mgpo_jax.schema import (
-    STRICT,
+from mgpo_jax.archives import (
     ArrayField,
     ArrayHeader,
+    array_headers,
+    mapped_arrays,
+    mapped_headers,
+    read_arrays,
+)
+from mgpo_jax.schema import (
+    STRICT,
     DemonstratorName,
     Json,
     Name,
     Sha256,
-    array_headers,
     checked_entry,
-    mapped_arrays,
-    mapped_headers,
-    read_arrays,
     read_document,
 )
 from mgpo_jax.settings import Count, Index, Seed

@@ -25,6 +25,7 @@ from pydantic import BaseModel
 from envs.base import ArraySpec, EnvSpec
 from envs.errors import DataError, UsageError, shown
 from envs.registry import World, find
+from mgpo_jax.archives import ArrayField, array_names, read_arrays
 from mgpo_jax.claims import claimed, cleaned_on_exit
 from mgpo_jax.distributions import HEADS
 from mgpo_jax.files import (
@@ -40,17 +41,7 @@ from mgpo_jax.files import (
 from mgpo_jax.kinds import KINDS, MULTI_GOAL, kind_of
 from mgpo_jax.policy import LoadedPolicy, check_fits
 from mgpo_jax.released import released_folder
-from mgpo_jax.schema import (
-    STRICT,
-    ArrayField,
-    Json,
-    Name,
-    Sha256,
-    array_names,
-    checked_entry,
-    read_arrays,
-    read_document,
-)
+from mgpo_jax.schema import STRICT, Json, Name, Sha256, checked_entry, read_document
 from mgpo_jax.seen_goals import MOST_KEPT, SeenGoals
 from mgpo_jax.settings import ENCODERS, Index
 from mgpo_jax.transformer import NetworkConfig, TransformerConfig

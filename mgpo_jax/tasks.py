@@ -16,10 +16,10 @@ import numpy as np
 from envs.base import Environment, Task
 from envs.errors import DataError, UsageError
 from envs.registry import World, find
+from mgpo_jax.archives import ArrayField, Sizes, fitted_arrays, read_arrays
 from mgpo_jax.dataset import hash_task
 from mgpo_jax.files import write_arrays
 from mgpo_jax.released import released_folder
-from mgpo_jax.schema import ArrayField, Sizes, fitted_arrays, read_arrays
 from mgpo_jax.trees import named_leaves
 
 # Streams of task seeds that never meet: test, evaluation while training; data seeds count from 0.

@@ -19,18 +19,9 @@ from pydantic import BaseModel
 
 from envs.errors import DataError
 from envs.registry import WORLDS
+from mgpo_jax.archives import ArrayField, array_names, fitted_arrays, read_arrays
 from mgpo_jax.files import write_arrays
-from mgpo_jax.schema import (
-    STRICT,
-    ArrayField,
-    Json,
-    array_names,
-    checked_entry,
-    fitted_arrays,
-    read_arrays,
-    read_document,
-    read_json_lines,
-)
+from mgpo_jax.schema import STRICT, Json, checked_entry, read_document, read_json_lines
 
 FIELDS = {
     "maze": ArrayField(("task", 3, 3), "int32"),
@@ -196,7 +187,7 @@ def test_an_array_of_an_expected_size_is_no_bomb(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Frames in which nearly nothing happens deflate to less than a hundredth."""
-    monkeypatch.setattr("mgpo_jax.schema.FREE", 1 << 20)
+    monkeypatch.setattr("mgpo_jax.archives.FREE", 1 << 20)
     frames = np.zeros((800, 84, 84), np.uint8)
     frames[:, 5, 5] = 7
     write_arrays(path, {"obs": frames})

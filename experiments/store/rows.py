@@ -37,9 +37,10 @@ from experiments.store.summary import (
     read_summary,
 )
 from experiments.store.tables import number, shortened, table
+from mgpo_jax.archives import ArrayField, array_names, read_arrays
 from mgpo_jax.methods import METHODS, policy_kind
 from mgpo_jax.released import released_folder
-from mgpo_jax.schema import ArrayField, array_names, read_arrays, read_document
+from mgpo_jax.schema import read_document
 
 PAPER_EPISODES = 100  # the paper's budget for one task
 SHOWN = (

@@ -28,8 +28,9 @@ from experiments.store.statistics import (
     stratified_bootstrap_iqm,
 )
 from experiments.store.tables import block
+from mgpo_jax.archives import ArrayField, read_arrays
 from mgpo_jax.methods import METHODS
-from mgpo_jax.schema import STRICT, ArrayField, Sha256, read_arrays, read_document
+from mgpo_jax.schema import STRICT, Sha256, read_document
 
 if TYPE_CHECKING:
     from experiments.store.results import Results

@@ -1,0 +1,538 @@
+"""Arrays in files: what they must look like, and how they are read, with faults as plain sentences.
+
+``ArrayField`` declares an array of an npz file: its axes, its kind of numbers and their range.
+``read_arrays`` reads all such files but those of ``journal``, which hold their own hash. It compares what
+the headers claim with what is declared and with the size of the file before it allocates any memory, runs
+nothing that a file holds, and converts what is valid but foreign, such as big-endian numbers.
+``mapped_arrays`` does the same for arrays in npy files, which it maps into memory as they are.
+"""
+
+from __future__ import annotations
+
+import ast
+import math
+import mmap
+import os
+import re
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import EllipsisType
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from envs.errors import DataError, printable
+from mgpo_jax.schema import tail_of
+
+MAX_MEMBERS = 10_000
+MAX_HEADER = 4096  # bytes; numpy writes 118
+FREE, MAX_RATIO = 512 << 20, 100
+"""Arrays whose sizes are not known beforehand may have ``FREE`` bytes together, or ``MAX_RATIO`` times
+those of their file."""
+DEFLATE = 1032  # bytes that one deflated byte can stand for
+CHUNK = 1 << 20  # bytes that are read, checked and converted at a time
+LARGEST = 1e18  # of a number, unless its field says otherwise
+_KINDS = {"integers": "iu", "numbers": "iuf", "anything": "biuf"}
+_WORDS_OF_KINDS = {
+    "b": "booleans",
+    "iu": "integers",
+    "iuf": "numbers",
+    "biuf": "numbers or booleans",
+}
+_UNREADABLE = (
+    OSError, EOFError, NotImplementedError, OverflowError, RuntimeError, ValueError, struct.error,
+    zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error,
+)  # fmt: skip
+"""What ``zipfile`` raises for files that are damaged or use what it does not know."""
+
+
+@dataclass(frozen=True)
+class ArrayField:
+    """What one array of a file must look like.
+
+    Attributes:
+      shape: its axes. A number is a size. A word stands for the size that all axes of this name have, and
+        names them in messages. ``...`` at the end stands for any further axes.
+      dtype: the dtype that it is converted to, or ``integers``, ``numbers`` or ``anything`` (with
+        booleans): then it keeps its own. Integers are numbers, but no number is taken as an integer.
+      required: whether it has to be there.
+      low: its smallest value (default: the smallest of the dtype, -1e18 for floats).
+      high: its largest value, likewise.
+      any_value: whether it may hold anything, NaN and infinity included.
+    """
+
+    shape: tuple[int | str | EllipsisType, ...]
+    dtype: str
+    required: bool = True
+    low: int | float | None = None
+    high: int | float | None = None
+    any_value: bool = False
+
+    @property
+    def kinds(self) -> str:
+        """The kinds of dtypes that can be converted to that of the field."""
+        if self.dtype in _KINDS:
+            return _KINDS[self.dtype]
+        kind = np.dtype(self.dtype).kind
+        return "iuf" if kind == "f" else "iu" if kind in "iu" else kind
+
+    def target(self, found: np.dtype) -> np.dtype:
+        """The dtype that an array of dtype ``found`` is converted to."""
+        return found.newbyteorder("=") if self.dtype in _KINDS else np.dtype(self.dtype)
+
+    def limits(self, target: np.dtype) -> tuple[Any, Any]:
+        """The smallest and the largest value that an array may hold."""
+        if target.kind == "f":
+            most = min(LARGEST, float(np.finfo(target).max))
+            least: Any = -most
+        else:
+            info = np.iinfo(target)
+            least, most = int(info.min), int(info.max)
+        return (
+            least if self.low is None else max(least, self.low),
+            most if self.high is None else min(most, self.high),
+        )
+
+
+class ArrayHeader(NamedTuple):
+    """What is known of an array before it is read."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    fortran: bool = False
+    offset: int = 0
+    """Bytes of the header."""
+
+    @property
+    def size(self) -> int:
+        return math.prod(self.shape)
+
+
+Sizes = Mapping[str, int | range]
+"""Sizes of axes by name: a number, or the range in which it must lie."""
+
+
+class _FaultError(Exception):
+    """What is wrong with an npz file, to stand after its name."""
+
+
+def array_names(path: Path, mend: str = "") -> list[str]:
+    """The names of the arrays in an npz file, from its directory alone.
+
+    Raises:
+      DataError: if it is missing or no npz file.
+    """
+    with _opened(path, mend) as archive:
+        return list(_members(archive))
+
+
+def array_headers(path: Path, mend: str = "") -> dict[str, ArrayHeader]:
+    """Shapes and dtypes of the arrays in an npz file, without reading them.
+
+    Raises:
+      DataError: if it is missing, no npz file, or an array cannot be as large as it claims.
+    """
+    with _opened(path, mend) as archive:
+        members = _members(archive)
+        headers = {name: _header(archive, name, info) for name, info in members.items()}
+        _check_claims(headers, members)
+        return headers
+
+
+def mapped_headers(folder: Path, names: Iterable[str], mend: str = "") -> dict[str, ArrayHeader]:
+    """Shapes and dtypes of the arrays in the files ``NAME.npy`` of a folder, without reading them.
+
+    Raises:
+      DataError: if one is missing, no npy file, or has another size than its header claims.
+    """
+    found = {}
+    for name in names:
+        path = folder / f"{name}.npy"
+        try:
+            with open(path, "rb") as file:
+                header = _read_header(path.name, file)
+                held = os.fstat(file.fileno()).st_size - header.offset
+            if header.size * header.dtype.itemsize != held:
+                raise _FaultError(
+                    f" claims shape {list(header.shape)} of {header.dtype}, the file has {held} bytes of it"
+                )
+        except FileNotFoundError:
+            raise DataError(f"{path} is missing{tail_of(mend)}") from None
+        except OSError as error:
+            raise DataError(f"{path} cannot be read ({error.strerror}){tail_of(mend)}") from None
+        except _FaultError as fault_:
+            raise DataError(f"{path}{fault_}{tail_of(mend)}") from None
+        found[name] = header
+    return found
+
+
+def mapped_arrays(
+    folder: Path,
+    fields: Mapping[str, ArrayField],
+    sizes: Sizes | None = None,
+    mend: str = "",
+) -> dict[str, np.ndarray]:
+    """Arrays in the files ``NAME.npy`` of a folder, as their fields say, mapped into memory to read.
+
+    Nothing is converted, so dtypes have to be those of the fields. Values are checked piece by piece, and
+    what was looked at does not stay in memory. An empty array is none that can be mapped, and is made.
+
+    Args:
+      folder: where the files lie.
+      fields: what is wanted, by name. Those that are not required may be missing.
+      sizes: what is known of the sizes of axes.
+      mend: what mends a file that is not as it should be, the end of the message.
+
+    Raises:
+      DataError: if a file is missing or damaged, or an array differs from its field.
+    """
+    there = [name for name, f in fields.items() if f.required or _npy(folder, name).is_file()]
+    headers = mapped_headers(folder, there, mend)
+    found = {}
+    try:
+        _check_kinds(headers, fields)
+        _check_shapes(headers, fields, sizes or {})
+        for name, header in headers.items():
+            if header.fortran or header.dtype != fields[name].target(header.dtype):
+                raise _FaultError(f": {name} has the dtype or order {header.dtype}, not its own")
+            place = _npy(folder, name)
+            array = (
+                np.memmap(place, header.dtype, "r", header.offset, header.shape)
+                if header.size
+                else np.zeros(header.shape, header.dtype)
+            )
+            _check_pieces(array, name, header, fields[name])
+            found[name] = array
+    except _FaultError as fault_:
+        raise DataError(f"{folder}{fault_}{tail_of(mend)}") from None
+    return found
+
+
+def _npy(folder: Path, name: str) -> Path:
+    return folder / f"{name}.npy"
+
+
+def _check_pieces(array: np.ndarray, name: str, header: ArrayHeader, field: ArrayField) -> None:
+    """``_check_values`` of all of an array, of which little is in memory at a time."""
+    if field.any_value or header.dtype.kind == "b":
+        return
+    flat = array.reshape(-1)
+    step = max(1, 16 * CHUNK // header.dtype.itemsize)
+    for first in range(0, len(flat), step):
+        _check_values(flat[first : first + step], name, header, field, first)
+        let_go(array)
+
+
+RESIDENT = 64 << 20
+"""Bytes of a mapped array that may stay in memory."""
+
+
+def let_go(array: np.ndarray) -> None:
+    """Take what was read of a large mapped array out of the process's memory.
+
+    It stays in the kernel's cache as long as there is room, so that reading it again is cheap. Without
+    this, a process seems to grow by every page that it has ever looked at.
+    """
+    base: Any = array
+    while isinstance(base, np.ndarray):
+        base = base.base
+    if isinstance(base, mmap.mmap) and len(base) > RESIDENT and hasattr(mmap, "MADV_DONTNEED"):
+        base.madvise(mmap.MADV_DONTNEED)
+
+
+def read_arrays(
+    path: Path,
+    fields: Mapping[str, ArrayField],
+    sizes: Sizes | None = None,
+    mend: str = "",
+    *,
+    only: bool = False,
+) -> dict[str, np.ndarray]:
+    """Arrays of an npz file, as their fields say; nothing else in the file is read.
+
+    Args:
+      path: the file.
+      fields: what is wanted, by name.
+      sizes: what is known of the sizes of axes.
+      mend: what mends a file that is not as it should be, the end of the message.
+      only: whether other arrays are an error.
+
+    Raises:
+      DataError: if the file is missing or damaged, or an array differs from its field.
+    """
+    with _opened(path, mend) as archive:
+        members = _members(archive)
+        if only and (foreign := sorted(members.keys() - fields.keys())):
+            raise _FaultError(f": {printable(foreign[0])} is foreign")
+        headers = {
+            name: _header(archive, name, members[name]) for name in fields if name in members
+        }
+        _check_kinds(headers, fields)
+        _check_claims(headers, members)
+        _check_shapes(headers, fields, sizes or {})
+        _check_unpacked_size(headers, fields, sizes or {}, path.stat().st_size)
+        return {
+            name: _read_member(archive, members[name], name, header, fields[name])
+            for name, header in headers.items()
+        }
+
+
+def fitted_arrays(
+    arrays: Mapping[str, np.ndarray],
+    fields: Mapping[str, ArrayField],
+    where: Path | str,
+    sizes: Sizes | None = None,
+    mend: str = "",
+) -> dict[str, np.ndarray]:
+    """Arrays in memory, checked and converted like those that ``read_arrays`` reads.
+
+    Raises:
+      DataError: if an array is missing or differs from its field.
+    """
+    headers = {
+        name: ArrayHeader(arrays[name].shape, arrays[name].dtype)
+        for name in fields
+        if name in arrays
+    }
+    try:
+        _check_kinds(headers, fields)
+        _check_shapes(headers, fields, sizes or {})
+        for name, header in headers.items():
+            _check_pieces(arrays[name], name, header, fields[name])
+    except _FaultError as fault_:
+        raise DataError(f"{where}{fault_}{tail_of(mend)}") from None
+    return {
+        name: arrays[name].astype(fields[name].target(header.dtype), copy=False)
+        for name, header in headers.items()
+    }
+
+
+@contextmanager
+def _opened(path: Path, mend: str) -> Iterator[zipfile.ZipFile]:
+    """An npz file to read; whatever is wrong with it becomes a ``DataError``."""
+    if not path.is_file():
+        raise DataError(f"{path} is missing{tail_of(mend)}")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            yield archive
+    except PermissionError as error:
+        raise DataError(f"{path} cannot be read ({error.strerror}){tail_of(mend)}") from None
+    except _FaultError as fault_:
+        raise DataError(f"{path}{fault_}{tail_of(mend)}") from None
+    except _UNREADABLE:
+        raise DataError(f"{path} is not a readable npz file{tail_of(mend)}") from None
+
+
+def _damaged(name: str, what: str) -> _FaultError:
+    return _FaultError(f" is not a readable npz file: {printable(name[:200])} {what}")
+
+
+def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    """What the archive holds, by the names of the arrays."""
+    infos = archive.infolist()
+    if len(infos) > MAX_MEMBERS:
+        raise _FaultError(f" is not a readable npz file: it has {len(infos)} members")
+    found: dict[str, zipfile.ZipInfo] = {}
+    for info in infos:
+        name = info.filename.removesuffix(".npy")
+        if name in found:
+            raise _damaged(name, "is there twice")
+        found[name] = info
+    return found
+
+
+def _header(archive: zipfile.ZipFile, name: str, info: zipfile.ZipInfo) -> ArrayHeader:
+    """What a member says of its array, without reading it."""
+    if info.flag_bits & 1:
+        raise _damaged(name, "is encrypted")
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise _damaged(name, f"has the unknown compression method {info.compress_type}")
+    try:
+        with archive.open(info) as file:
+            return _read_header(name, file)
+    except _UNREADABLE:
+        raise _damaged(name, "is damaged") from None
+
+
+def _read_header(name: str, file: Any) -> ArrayHeader:
+    """What the first bytes of an array in the format npy say of it."""
+    start = file.read(8)
+    if start[:6] != b"\x93NUMPY":
+        raise _damaged(name, "is no array")
+    width = {1: 2, 2: 4, 3: 4}.get(start[6], 0) if len(start) == 8 else 0
+    length = int.from_bytes(file.read(width), "little")
+    if not width or length > MAX_HEADER:
+        raise _damaged(name, "has a damaged header")
+    return _parsed_header(name, file.read(length), 8 + width + length)
+
+
+def _parsed_header(name: str, text: bytes, offset: int) -> ArrayHeader:
+    try:
+        if sum(text.count(bracket) for bracket in b"([{") > 8:  # deep nesting exhausts the parser
+            raise ValueError
+        said = ast.literal_eval(text.decode("latin1").strip())
+        descr, fortran, shape = (said[key] for key in ("descr", "fortran_order", "shape"))
+        if not isinstance(descr, str):
+            raise _damaged(name, "holds records")
+        if not re.fullmatch(r"[<>|=]?[biufcSUVOmM?]\d{0,9}(\[\w{1,9}\])?", descr):
+            raise ValueError
+        dtype = np.dtype(descr)
+        sound = isinstance(shape, tuple) and all(
+            type(size) is int and 0 <= size < 2**63 for size in shape
+        )
+        if not sound or type(fortran) is not bool or len(shape) > 32:
+            raise ValueError
+    except (KeyError, MemoryError, RecursionError, SyntaxError, TypeError, ValueError):
+        raise _damaged(name, "has a damaged header") from None
+    return ArrayHeader(shape, dtype, fortran, offset)
+
+
+def _check_kinds(headers: Mapping[str, ArrayHeader], fields: Mapping[str, ArrayField]) -> None:
+    """Raise for arrays that are missing, or the first that has another kind of numbers than its field."""
+    missing = [name for name, field in fields.items() if field.required and name not in headers]
+    if missing:
+        raise _FaultError(f" lacks {', '.join(missing)}")
+    for name, header in headers.items():
+        if header.dtype.kind not in fields[name].kinds:
+            words = _WORDS_OF_KINDS[fields[name].kinds]
+            raise _FaultError(f": {name} must hold {words}, found {header.dtype}")
+
+
+def _check_shapes(
+    headers: Mapping[str, ArrayHeader], fields: Mapping[str, ArrayField], sizes: Sizes
+) -> None:
+    """Raise for the first array that has another shape than its field and those before it."""
+    known = {axis: _only(size) if isinstance(size, int) else size for axis, size in sizes.items()}
+    for name, header in headers.items():
+        if not _fits(header.shape, fields[name], known):
+            wanted = ", ".join(_described(axis, known) for axis in fields[name].shape)
+            raise _FaultError(f": {name} has shape {list(header.shape)}, wanted [{wanted}]")
+
+
+def _only(size: int) -> range:
+    return range(size, size + 1)
+
+
+def _fits(shape: Sequence[int], field: ArrayField, known: dict[str, range]) -> bool:
+    """Whether a shape is that of a field; sizes of axes that were not known are noted."""
+    axes = [axis for axis in field.shape if not isinstance(axis, EllipsisType)]
+    if len(shape) < len(axes) or (len(shape) > len(axes) and ... not in field.shape):
+        return False
+    for axis, size in zip(axes, shape, strict=False):
+        if size not in (_only(axis) if isinstance(axis, int) else known.get(axis, _only(size))):
+            return False
+        if isinstance(axis, str):
+            known[axis] = _only(size)
+    return True
+
+
+def _described(axis: int | str | EllipsisType, known: Mapping[str, range]) -> str:
+    """An axis of a field in a message, with its size where it is known."""
+    if not isinstance(axis, str):
+        return "..." if isinstance(axis, EllipsisType) else str(axis)
+    sizes = known.get(axis)
+    if sizes is None:
+        return axis
+    return f"{axis} {sizes[0]}" if len(sizes) == 1 else f"{axis} {sizes[0]} to {sizes[-1]}"
+
+
+def _check_claims(
+    headers: Mapping[str, ArrayHeader], members: Mapping[str, zipfile.ZipInfo]
+) -> None:
+    """Raise if an array cannot have the size that its header claims, before memory is taken for it."""
+    for name, header in headers.items():
+        info = members[name]
+        held = info.file_size - header.offset
+        stored = info.compress_type == zipfile.ZIP_STORED
+        most = info.compress_size * (1 if stored else DEFLATE) + (0 if stored else DEFLATE)
+        if header.size * header.dtype.itemsize != held or not info.file_size <= most:
+            raise _FaultError(
+                f": {name} claims shape {list(header.shape)} of {header.dtype}, the file has "
+                f"{min(held, most)} bytes of it"
+            )
+
+
+def _check_unpacked_size(
+    headers: Mapping[str, ArrayHeader],
+    fields: Mapping[str, ArrayField],
+    sizes: Sizes,
+    file_size: int,
+) -> None:
+    """Raise if a small file would fill the memory with arrays that nobody expects to be so large."""
+    total = sum(
+        header.size * fields[name].target(header.dtype).itemsize
+        for name, header in headers.items()
+        if not _is_expected(fields[name], sizes)
+    )
+    if total > max(FREE, MAX_RATIO * file_size):
+        raise _FaultError(
+            f" claims {total >> 20} MB of arrays in a file of {file_size >> 20} MB, which cannot be sound"
+        )
+
+
+def _is_expected(field: ArrayField, sizes: Sizes) -> bool:
+    """Whether the sizes of all axes of an array are known before its file is opened."""
+    known = {name for name, size in sizes.items() if isinstance(size, int)}
+    return all(isinstance(axis, int) or axis in known for axis in field.shape)
+
+
+def _read_member(
+    archive: zipfile.ZipFile,
+    info: zipfile.ZipInfo,
+    name: str,
+    header: ArrayHeader,
+    field: ArrayField,
+) -> np.ndarray:
+    """Read one array; it is checked and converted piece by piece, so that it is never there twice."""
+    array = np.empty(header.shape, field.target(header.dtype))
+    # Numbers lie in the order of the last axis, or of the first one for Fortran.
+    flat = array.T.flat if header.fortran else array.reshape(-1)
+    step, itemsize, first = max(1, CHUNK // header.dtype.itemsize), header.dtype.itemsize, 0
+    try:
+        with archive.open(info) as file:
+            file.read(header.offset)
+            while first < array.size:
+                raw = file.read(min(step, array.size - first) * itemsize)
+                if not raw or len(raw) % itemsize:
+                    raise EOFError
+                # Any byte but 0 means true.
+                values = (
+                    np.frombuffer(raw, np.uint8) != 0
+                    if header.dtype.kind == "b"
+                    else np.frombuffer(raw, header.dtype)
+                )
+                _check_values(values, name, header, field, first)
+                with np.errstate(all="ignore"):  # where any value is allowed, it may be too large
+                    flat[first : first + len(values)] = values
+                first += len(values)
+            file.read(1)  # compares the checksum of the member
+    except _UNREADABLE:
+        raise _damaged(name, "is damaged") from None
+    return array
+
+
+def _check_values(
+    values: np.ndarray, name: str, header: ArrayHeader, field: ArrayField, first: int = 0
+) -> None:
+    """Raise for the first of some numbers, counted from ``first``, that its field does not allow."""
+    if field.any_value or values.dtype.kind == "b" or not len(values):
+        return
+    low, high = field.limits(field.target(header.dtype))
+    with np.errstate(all="ignore"):
+        if values.min() >= low and values.max() <= high:  # neither is true of NaN
+            return
+        index = int(np.flatnonzero(~((values >= low) & (values <= high)))[0])
+    value = values[index]
+    found = f"{value:g}" if math.isfinite(value) else "NaN" if math.isnan(value) else "infinity"
+    order: Literal["F", "C"] = "F" if header.fortran else "C"
+    place = [int(axis) for axis in np.unravel_index(first + index, header.shape, order)]
+    named = zip(field.shape, place, strict=False)
+    words = [f"{axis} {number}" for axis, number in named if isinstance(axis, str)]
+    where = ", ".join(words) if words else str(place)
+    at = f" at {where}" if place else ""
+    raise _FaultError(f": {name} holds {found}{at}, must be from {low:.12g} to {high:.12g}")
