@@ -27,8 +27,9 @@ from experiments.store.work import PIECES, long_work
 from mgpo_jax import methods, processes
 from mgpo_jax.files import hash_arrays, new_folder, remove_leftovers, to_json
 from mgpo_jax.journal import Journal
+from mgpo_jax.outcomes import Outcome
 from mgpo_jax.policy import LoadedPolicy
-from mgpo_jax.runner import Outcome, sweep
+from mgpo_jax.runner import sweep
 from mgpo_jax.schema import Json, read_document
 from mgpo_jax.seen_goals import warning_of_goals
 from mgpo_jax.tasks import evaluation_tasks, load_tasks, task_arrays, test_tasks

@@ -30,8 +30,8 @@ from mgpo_jax.claims import check_place
 from mgpo_jax.dataset import Dataset, hash_task, load_dataset, write_dataset
 from mgpo_jax.files import remove_leftovers
 from mgpo_jax.journal import Journal
+from mgpo_jax.lanes import together
 from mgpo_jax.progress import Progress
-from mgpo_jax.runner import together
 from mgpo_jax.sharding import fetch
 from mgpo_jax.tasks import benchmark_tasks, task_hashes
 

@@ -32,9 +32,9 @@ from experiments.store.results import Results
 from experiments.store.seals import is_foreign, write_sealed
 from experiments.store.settings import file_name
 from experiments.store.statistics import same_tasks
+from mgpo_jax.judging import play
 from mgpo_jax.prompts import prompt_of
 from mgpo_jax.rollout import Query
-from mgpo_jax.runner import play
 
 Picture = tuple[str, Save]
 """The name of a file, and what writes it."""

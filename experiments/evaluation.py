@@ -23,11 +23,11 @@ from experiments.store.statistics import SeedSpread, mean_log_success, seed_spre
 from experiments.store.tables import table
 from mgpo_jax import processes
 from mgpo_jax.files import hash_arrays
+from mgpo_jax.judging import evaluate_fully
 from mgpo_jax.optimizers.methods import judged_query
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.progress import Progress
 from mgpo_jax.prompts import Prompt
-from mgpo_jax.runner import evaluate_fully
 from mgpo_jax.seen_goals import warning_of_prompts
 from mgpo_jax.tasks import tasks_from
 

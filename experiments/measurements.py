@@ -26,11 +26,12 @@ from experiments.store.settings import PretrainConfig, pretrain_preset
 from experiments.training import configured_network
 from mgpo_jax import methods, processes
 from mgpo_jax.dataset import BatchPlan, Dataset
+from mgpo_jax.lanes import cache_bytes, lanes_together, together
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.policy_files import load_policy
 from mgpo_jax.prompts import Prompt, single_goal
 from mgpo_jax.rollout import Query, rollout
-from mgpo_jax.runner import adapt, cache_bytes, lanes_together, together
+from mgpo_jax.runner import adapt
 from mgpo_jax.settings import TrainConfig
 from mgpo_jax.sharding import device_mesh, devices_for
 from mgpo_jax.tasks import benchmark_tasks

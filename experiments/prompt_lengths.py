@@ -21,9 +21,9 @@ from experiments.store.policies import load_policy_of
 from experiments.store.results import Results
 from experiments.store.statistics import SeedSpread, seed_spread
 from experiments.store.tables import number, table
+from mgpo_jax.judging import uncertainty
 from mgpo_jax.prompts import Prompt
 from mgpo_jax.rollout import Query
-from mgpo_jax.runner import uncertainty
 
 DRAWS = 2  # prompts of each length from each trajectory
 HEAD = (

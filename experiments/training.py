@@ -49,6 +49,7 @@ from mgpo_jax.claims import claimed
 from mgpo_jax.dataset import BatchPlan, Dataset, spec_of
 from mgpo_jax.files import remove_unfinished, to_json, written
 from mgpo_jax.kinds import KINDS, MULTI_GOAL, kind_of
+from mgpo_jax.lanes import together
 from mgpo_jax.manifest import read_facts
 from mgpo_jax.optimizers.methods import judged_query
 from mgpo_jax.policy import LoadedPolicy, transformer_policy
@@ -56,7 +57,6 @@ from mgpo_jax.policy_files import MEND, read_policy, save_policy
 from mgpo_jax.progress import Progress
 from mgpo_jax.prompts import Prompt, sample_prompt, single_goal
 from mgpo_jax.rollout import rollout
-from mgpo_jax.runner import together
 from mgpo_jax.seen_goals import seen_in
 from mgpo_jax.settings import TrainConfig
 from mgpo_jax.sharding import device_mesh, devices_for, fetch

@@ -31,16 +31,18 @@ if TYPE_CHECKING:
     from mgpo_jax.acting import Actor
     from mgpo_jax.adaptation import Adapter, AdaptResult, search
     from mgpo_jax.dataset import Dataset, load_dataset, save_dataset
+    from mgpo_jax.judging import evaluate, play
     from mgpo_jax.methods import Method, Setting
     from mgpo_jax.methods import names as method_names
     from mgpo_jax.methods import register as register_method
     from mgpo_jax.optimizers import SearchSpace, bbt, bpe, explore, grips, ucb
     from mgpo_jax.optimizers.methods import prompt_adapter
+    from mgpo_jax.outcomes import Outcome
     from mgpo_jax.policy import LoadedPolicy, Policy
     from mgpo_jax.policy_files import load_policy, save_policy
     from mgpo_jax.prompts import Prompt, goals_of, prompt_of, sample_prompt, single_goal
     from mgpo_jax.rollout import Query, prompted
-    from mgpo_jax.runner import Outcome, adapt, evaluate, play, sweep
+    from mgpo_jax.runner import adapt, sweep
     from mgpo_jax.settings import TrainConfig, static
     from mgpo_jax.tasks import load_tasks, sample_tasks, save_tasks, test_tasks
     from mgpo_jax.training import pretrain
@@ -56,14 +58,16 @@ _PLACES = {
     "mgpo_jax.acting": ("Actor",),
     "mgpo_jax.adaptation": ("AdaptResult", "Adapter", "search"),
     "mgpo_jax.dataset": ("Dataset", "load_dataset", "save_dataset"),
+    "mgpo_jax.judging": ("evaluate", "play"),
     "mgpo_jax.methods": ("Method", "Setting"),
     "mgpo_jax.optimizers": ("SearchSpace", "bbt", "bpe", "explore", "grips", "ucb"),
     "mgpo_jax.optimizers.methods": ("prompt_adapter",),
+    "mgpo_jax.outcomes": ("Outcome",),
     "mgpo_jax.policy": ("LoadedPolicy", "Policy"),
     "mgpo_jax.policy_files": ("load_policy", "save_policy"),
     "mgpo_jax.prompts": ("Prompt", "goals_of", "prompt_of", "sample_prompt", "single_goal"),
     "mgpo_jax.rollout": ("Query", "prompted"),
-    "mgpo_jax.runner": ("Outcome", "adapt", "evaluate", "play", "sweep"),
+    "mgpo_jax.runner": ("adapt", "sweep"),
     "mgpo_jax.settings": ("TrainConfig", "static"),
     "mgpo_jax.tasks": ("load_tasks", "sample_tasks", "save_tasks", "test_tasks"),
     "mgpo_jax.training": ("pretrain",),

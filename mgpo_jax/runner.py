@@ -1,9 +1,7 @@
-"""Runs many episodes and adaptations at once. Everything that commands and examples run goes through here.
+"""Adapts to many tasks at once. Everything that commands and examples search with goes through here.
 
-Every task, seed and variant of a method is a *lane* of one compiled program. Lanes are spread over the
-devices of all processes that work together and, on each, run in *groups*: the lanes of a group share one
-clock, so that a group's episode ends with its slowest lane. On a CPU a group is as large as the memories of
-its agents fit into the cache near a core, or as large as a step of the world needs to be worth its call.
+A run is cut into segments of rounds, each followed by a judgement of the best choice so far. All lanes
+(``mgpo_jax.lanes``) take a segment together in one compiled program; what is finished is kept in a journal.
 """
 
 from __future__ import annotations
@@ -12,18 +10,17 @@ import math
 import os
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, PRNGKeyArray
 
-from envs.base import Environment, Episode, Goals, Task
-from envs.errors import DataError, NotAvailableError, UsageError
+from envs.base import Environment, Task
+from envs.errors import DataError, UsageError
 from envs.registry import Judgement, World
 from envs.registry import find as find_world
 from mgpo_jax import processes
@@ -31,78 +28,19 @@ from mgpo_jax.adaptation import (
     Adapter,
     AdaptLog,
     Judged,
-    achieved_goals,
-    judge,
     proceed,
     start,
 )
 from mgpo_jax.journal import Journal
+from mgpo_jax.lanes import Grid, Lanes, Layout, lay_out, over_lanes
 from mgpo_jax.methods import Method, Setting, find, split_hyper, with_numbers
-from mgpo_jax.policy import LoadedPolicy, check_fits, transformer_policy
+from mgpo_jax.outcomes import Outcome, Record, Segment, without_goals
+from mgpo_jax.policy import LoadedPolicy, check_fits
 from mgpo_jax.progress import Progress
-from mgpo_jax.rollout import Query, rollout
-from mgpo_jax.sharding import fetch, is_key, mesh_of_all, on_devices, replicate, split
+from mgpo_jax.sharding import fetch, is_key, on_devices, replicate, split
 from mgpo_jax.stopping import ended, filled
 from mgpo_jax.tasks import num_tasks
-from mgpo_jax.transformer import GoalTransformer, TransformerConfig
 from mgpo_jax.trees import numbered_leaves, with_leaves
-
-# Bytes of the agents' memories (key-value caches) in a group: what fits into the cache of a CPU's core, or
-# into the memory of an accelerator.
-GROUP_BYTES, GROUP_BYTES_ACCELERATOR = 3 << 20, 4 << 30
-
-
-class Reached(NamedTuple):
-    """The goals that episodes reached, of all episodes one after another."""
-
-    counts: np.ndarray
-    """``[S, N, E]``: how many goals each episode reached."""
-    steps: np.ndarray
-    """``[total]``: in which step each was reached, counted from 0."""
-    goals: np.ndarray
-    """``[total, G]``."""
-
-
-class Outcome(NamedTuple):
-    """Raw results of one method, axes S seeds, N tasks, E episodes, R rounds, C judgements."""
-
-    returns: np.ndarray
-    """``[S, N, E]`` returns of the search's episodes."""
-    failed: np.ndarray
-    """``[S, N, E]``: whether the world broke down."""
-    choices: Any
-    """Who acted, leaves ``[S, N, R, ..]``."""
-    best: Any
-    """The best choice after each round, leaves ``[S, N, R, ..]``."""
-    lengths: np.ndarray
-    """``[S, N, E]``: steps of the episodes."""
-    keys: np.ndarray
-    """``[S, N, E, 2]``: raw random keys of the episodes."""
-    actions: np.ndarray | None
-    """``[S, N, E, T]`` small integers (``adaptation.small_actions``); None if they were not kept."""
-    reached: Reached
-    eval_episodes: np.ndarray
-    """``[C]``: after how many episodes the best choice was judged."""
-    eval_returns: np.ndarray
-    """``[S, N, C]``: mean return of the judging episodes. The first is that of the initial choice."""
-    num_episodes: int
-    """All episodes that were run: those of the search and those that judged."""
-    num_failed: int
-    """Those that the world ended because it broke down."""
-    cpu_seconds: float
-    """CPU time of all of them, without compilation."""
-    eval_achieved: np.ndarray | None = None
-    """``[S, N, C, M]``: share of the judging episodes that achieved each of the world's M named goals; None
-    in worlds without any (``Environment.goal_names``)."""
-    num_scored: np.ndarray | None = None
-    """``[S, N, R]``: prompts scored without an episode until the end of each round; None for methods that
-    learn by episodes alone."""
-
-
-def together(env: Environment, function: Callable, in_axes: Any = 0) -> Any:
-    """A compiled ``function`` over many episodes, which share one clock on one device."""
-    options = dict(env.engine.compiler_options)
-    return jax.jit(jax.vmap(function, in_axes=in_axes), compiler_options=options)
 
 
 def adapt(
@@ -212,7 +150,7 @@ def sweep(
     grid = Grid(variants=len(hypers), seeds=seeds, tasks=num_tasks(tasks))
     _check_room(env, grid, episodes)
     begin()
-    layout = _lay_out(env, grid.size, _memory_bytes(env, adapter, tasks))
+    layout = lay_out(env, grid.size, _memory_bytes(env, adapter, tasks))
     program = _program(method, setting, fixed, layout, max(segments), keep_actions)
     lanes = grid.lanes(layout, tasks, seed, numbers, ends_early=stop_at is not None)
     lanes = split(layout.mesh, lanes)
@@ -280,65 +218,6 @@ def _segments(adapter: Adapter, episodes: int, eval_every: int) -> list[int]:
     return [eval_every // num] * whole + ([rest // num] if rest else [])
 
 
-class Lanes(NamedTuple):
-    """What each lane has of its own."""
-
-    task: Task
-    key: PRNGKeyArray
-    numbers: dict[str, Array]
-    """Hyper-parameters that are data."""
-    stopped: Bool[Array, "*lanes"] | None = None
-    """Whether the search has ended; None where none ends early."""
-
-
-class Layout(NamedTuple):
-    """How lanes are spread: over devices, and on each in groups that share a clock."""
-
-    mesh: Mesh
-    group: int
-    num_lanes: int
-    """With those that only fill up the last groups."""
-
-
-@dataclass(frozen=True)
-class Grid:
-    """How lanes are numbered: variants, then seeds, then tasks."""
-
-    variants: int
-    seeds: int
-    tasks: int
-
-    @property
-    def size(self) -> int:
-        return self.variants * self.seeds * self.tasks
-
-    def lanes(
-        self,
-        layout: Layout,
-        tasks: Task,
-        seed: int,
-        numbers: dict[str, list[int | float]],
-        ends_early: bool = False,
-    ) -> Lanes:
-        """The lanes; those beyond the last variant repeat the first ones to fill up a group.
-
-        With ``ends_early`` each says whether it has stopped.
-        """
-        index = np.arange(layout.num_lanes)
-        runs = self.seeds * self.tasks
-        which = index // runs % self.variants
-        return Lanes(
-            task=jax.tree.map(lambda leaf: jnp.asarray(leaf)[index % self.tasks], tasks),
-            key=jax.random.split(jax.random.key(seed), runs)[index % runs],
-            numbers={name: jnp.array(values)[which] for name, values in numbers.items()},
-            stopped=jnp.zeros(layout.num_lanes, bool) if ends_early else None,
-        )
-
-    def shape(self, rows: np.ndarray) -> np.ndarray:
-        """Rows of lanes as ``[variants, S, N, ..]``, without the lanes that only fill up groups."""
-        return rows[: self.size].reshape(self.variants, self.seeds, self.tasks, *rows.shape[1:])
-
-
 def _memory_bytes(env: Environment, adapter: Adapter, tasks: Task) -> int:
     """Bytes of an agent's memory at the end of an episode."""
 
@@ -352,33 +231,6 @@ def _memory_bytes(env: Environment, adapter: Adapter, tasks: Task) -> int:
     task = jax.tree.map(lambda leaf: leaf[0], tasks)
     shapes = jax.eval_shape(memory, jax.random.key(0), task)
     return sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes))
-
-
-def lanes_together(env: Environment, memory_bytes: int) -> int:
-    """How many lanes share a clock."""
-    limit = GROUP_BYTES if jax.default_backend() == "cpu" else GROUP_BYTES_ACCELERATOR
-    return max(env.engine.worlds_together, limit // max(memory_bytes, 1), 1)
-
-
-def _lay_out(env: Environment, num_lanes: int, memory_bytes: int) -> Layout:
-    """Spread at least ``num_lanes`` lanes evenly."""
-    mesh = mesh_of_all()
-    on_each = -(-num_lanes // mesh.devices.size)
-    num_groups = -(-on_each // lanes_together(env, memory_bytes))
-    group = -(-on_each // num_groups)
-    return Layout(mesh, group, mesh.devices.size * num_groups * group)
-
-
-def _over_lanes(env: Environment, layout: Layout, function: Callable) -> Any:
-    """A jitted ``function(own, shared)`` over all lanes."""
-
-    def on_device(own: Any, shared: Any) -> Any:
-        grouped = jax.tree.map(lambda leaf: leaf.reshape(-1, layout.group, *leaf.shape[1:]), own)
-        done = jax.lax.map(lambda own: jax.vmap(function, in_axes=(0, None))(own, shared), grouped)
-        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), done)
-
-    options = dict(env.engine.compiler_options)
-    return on_devices(layout.mesh, on_device, [True, False], True, compiler_options=options)
 
 
 class Program:
@@ -439,63 +291,9 @@ def _program(
         )
 
     return Programs(
-        Program(_over_lanes(env, layout, begin)),
-        Program(_over_lanes(env, layout, advance)),
+        Program(over_lanes(env, layout, begin)),
+        Program(over_lanes(env, layout, advance)),
     )
-
-
-class Record(NamedTuple):
-    """What an adaptation left behind, rows of lanes; the log is without the goals that were reached."""
-
-    log: AdaptLog
-    judged: Judged
-    reached: list[Goals]
-    """The goals of each segment's episodes, ``[lanes, R, K, T, ..]``."""
-
-    def outcome(
-        self, variant: int, grid: Grid, after: np.ndarray, num_episodes: int, cpu_seconds: float
-    ) -> Outcome:
-        """The results of one variant."""
-
-        def of_variant(rows: Any) -> np.ndarray:
-            return grid.shape(rows)[variant]
-
-        def by_episode(rows: Any) -> np.ndarray:
-            rows = of_variant(rows)
-            return rows.reshape(*rows.shape[:2], -1, *rows.shape[4:])
-
-        failed = by_episode(self.log.failed)
-        num_failed = failed.sum() + of_variant(self.judged.num_failed).sum()
-        return Outcome(
-            returns=by_episode(self.log.returns),
-            failed=failed,
-            choices=jax.tree.map(of_variant, self.log.choices),
-            best=jax.tree.map(of_variant, self.log.best),
-            lengths=np.concatenate([by_episode(goals.length) for goals in self.reached], axis=2),
-            keys=by_episode(self.log.played.key),
-            actions=jax.tree.map(by_episode, self.log.played.actions),
-            reached=_reached([jax.tree.map(by_episode, goals) for goals in self.reached]),
-            eval_episodes=after,
-            eval_returns=of_variant(self.judged.return_),
-            num_episodes=num_episodes,
-            num_failed=int(num_failed),
-            cpu_seconds=cpu_seconds,
-            eval_achieved=_by_judgement(jax.tree.map(of_variant, self.judged.achieved)),
-            num_scored=jax.tree.map(of_variant, self.log.num_scored),
-        )
-
-
-def _by_judgement(achieved: np.ndarray | None) -> np.ndarray | None:
-    """Shares [S, N, M, C] as [S, N, C, M]."""
-    return None if achieved is None else np.moveaxis(achieved, -1, -2)
-
-
-class Segment(NamedTuple):
-    """What a finished segment leaves behind, rows of lanes."""
-
-    log: AdaptLog
-    judged: Judged
-    cpu_seconds: float
 
 
 class Run(NamedTuple):
@@ -561,7 +359,7 @@ def _run(run: Run, journal: Journal) -> tuple[Record, float]:
             before += num
     logs = [segment.log for segment in done[1:]]
     goals = [log.played.goals for log in logs]
-    whole = jax.tree.map(lambda *rows: np.concatenate(rows, axis=1), *map(_without_goals, logs))
+    whole = jax.tree.map(lambda *rows: np.concatenate(rows, axis=1), *map(without_goals, logs))
     judged = jax.tree.map(lambda *rows: np.stack(rows, axis=-1), *(s.judged for s in done))
     return Record(whole, judged, goals), sum(segment.cpu_seconds for segment in done)
 
@@ -650,203 +448,3 @@ def _resumed(
 
     state = split(layout.mesh, jax.tree.map(placed, with_leaves(state, saved), state))
     return [s._replace(cpu_seconds=float(s.cpu_seconds)) for s in done], state
-
-
-def _without_goals(log: AdaptLog) -> AdaptLog:
-    """The log without the goals that were reached, which take most of its memory."""
-    nothing: Any = None
-    return log._replace(played=log.played._replace(goals=nothing))
-
-
-def _reached(segments: Sequence[Goals]) -> Reached:
-    """The goals reached in the episodes of consecutive segments, ``[S, N, E, T, ..]`` each."""
-    real = [
-        goals.goal_reached & (np.arange(goals.goal_reached.shape[-1]) < goals.length[..., None])
-        for goals in segments
-    ]
-    counts = np.concatenate([which.sum(axis=-1) for which in real], axis=2)
-    reached = np.concatenate(real, axis=2)
-    steps = np.nonzero(reached)[-1]
-    achieved = np.concatenate([goals.achieved_goals for goals in segments], axis=2)
-    small = np.min_scalar_type(reached.shape[-1])
-    return Reached(counts.astype(np.int32), steps.astype(small), achieved[reached])
-
-
-def evaluate(
-    env: Environment,
-    policy: LoadedPolicy,
-    tasks: Task,
-    queries: Query,
-    *,
-    episodes: int,
-    seed: int = 0,
-) -> tuple[np.ndarray, int]:
-    """Mean returns ``[S, N]`` of queries with leaves ``[S, N, ..]``, one for each seed and task.
-
-    The second result is how many episodes a broken world ended. ``evaluate_fully`` tells more.
-
-    Raises:
-      DataError: if the policy was made for another world, or a return is not finite.
-    """
-    judged = evaluate_fully(env, policy, tasks, queries, episodes=episodes, seed=seed)
-    return np.asarray(judged.return_), int(judged.num_failed.sum())
-
-
-def evaluate_fully(
-    env: Environment,
-    policy: LoadedPolicy,
-    tasks: Task,
-    queries: Query,
-    *,
-    episodes: int,
-    seed: int = 0,
-) -> Judged:
-    """Judge queries in fresh episodes.
-
-    Args:
-      env: the world.
-      policy: who acts.
-      tasks: N tasks, stacked.
-      queries: with leaves ``[S, N, ..]``, one for each seed and task.
-      episodes: how many each query is judged in.
-      seed: seed of the episodes.
-
-    Returns:
-      Numpy arrays: ``return_`` [S, N], ``num_failed`` [S, N] and, in worlds with M named goals,
-      ``achieved`` [S, N, M].
-
-    Raises:
-      DataError: if the policy was made for another world, or a return is not finite.
-    """
-    run = partial(_measurement, num_episodes=episodes)
-    return _of_queries(run, env, policy, tasks, queries, seed)
-
-
-class Uncertainty(NamedTuple):
-    """How sure a policy was of its actions in its own episodes."""
-
-    entropy: Float[Array, "*batch"]
-    """Of the distributions that it acted from, in nats, mean over the steps of the episode; NaN where the
-    policy's head has no closed form of it."""
-    return_: Float[Array, "*batch"]
-    num_steps: Int[Array, "*batch"]
-
-
-def uncertainty(
-    env: Environment, policy: LoadedPolicy, tasks: Task, queries: Query, *, seed: int = 0
-) -> Uncertainty:
-    """How sure a policy is of its actions under each query, in one fresh episode of it.
-
-    Args:
-      env: the world.
-      policy: who acts.
-      tasks: N tasks, stacked.
-      queries: with leaves ``[S, N, ..]``.
-      seed: seed of the episodes.
-
-    Returns:
-      Numpy arrays [S, N].
-
-    Raises:
-      DataError: if the policy was made for another world, or a return is not finite.
-    """
-    return _of_queries(_uncertainty, env, policy, tasks, queries, seed)
-
-
-@cache
-def _uncertainty(env: Environment, network: TransformerConfig, layout: Layout) -> Any:
-    """``((lanes, queries), params) -> uncertainty``, compiled once a process."""
-
-    def measure(own: tuple[Lanes, Query], params: Any) -> Uncertainty:
-        lane, query = own
-        done = rollout(lane.key, env, transformer_policy(network, params), lane.task, query)
-        # One pass over the whole episode gives the same distributions as the steps did.
-        episode = done.trajectory
-        distribution: Any = GoalTransformer(network).apply(
-            params, query.prompt, episode.obs, episode.actions
-        )
-        real = jnp.arange(len(episode.obs)) < episode.length
-        try:
-            entropy = jnp.sum(jnp.where(real, distribution.entropy(), 0.0)) / episode.length
-        except NotAvailableError:
-            entropy = jnp.float32(jnp.nan)
-        return Uncertainty(entropy, done.return_, episode.length)
-
-    return _over_lanes(env, layout, measure)
-
-
-def _of_queries(
-    program: Callable,
-    env: Environment,
-    policy: LoadedPolicy,
-    tasks: Task,
-    queries: Query,
-    seed: int,
-) -> Any:
-    """What a program finds for queries with leaves ``[S, N, ..]``, as numpy arrays with these axes.
-
-    ``program(env, network, layout)`` is a function ``((lanes, queries), params) -> found`` over all lanes;
-    what it finds has a field ``return_``.
-    """
-    check_fits(policy.config, env.spec)
-    seeds, num = queries.prompt.mask.shape[:2]
-    grid = Grid(variants=1, seeds=seeds, tasks=num)
-    layout = _lay_out(env, grid.size, cache_bytes(policy.config))
-    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), queries)
-    index = np.arange(layout.num_lanes) % grid.size
-    own = (
-        grid.lanes(layout, tasks, seed, {}),
-        jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], flat),
-    )
-    run = program(env, policy.config, layout)
-    found = fetch(run(split(layout.mesh, own), replicate(layout.mesh, policy.params)))
-    found = jax.tree.map(lambda rows: grid.shape(rows)[0], found)
-    if not (finite := np.isfinite(found.return_)).all():
-        which, task = np.argwhere(~finite)[0]
-        raise DataError(
-            f"a return on task {task} with seed number {which} is {found.return_[which, task]}; the world "
-            "or the policy is broken"
-        )
-    return found
-
-
-@cache
-def _measurement(
-    env: Environment, network: TransformerConfig, layout: Layout, num_episodes: int
-) -> Any:
-    """``((lanes, queries), params) -> judged``, compiled once a process."""
-
-    def measure(own: tuple[Lanes, Query], params: Any) -> Judged:
-        lane, query = own
-        policy = transformer_policy(network, params)
-
-        def episode(key: PRNGKeyArray) -> tuple[Array, Array, Array | None]:
-            done = rollout(key, env, policy, lane.task, query)
-            achieved = achieved_goals(env, done.trajectory)
-            return done.return_, jnp.asarray(done.failed), achieved
-
-        return judge(*jax.lax.map(episode, jax.random.split(lane.key, num_episodes)))
-
-    return _over_lanes(env, layout, measure)
-
-
-def cache_bytes(network: TransformerConfig) -> int:
-    """Bytes of the key-value cache of an episode."""
-    num_tokens = network.max_prompt_length + network.num_step_tokens(network.horizon)
-    return 4 * 2 * network.num_layers * network.embed_dim * num_tokens
-
-
-@cache
-def _player(env: Environment, network: TransformerConfig) -> Any:
-    def episode(key: PRNGKeyArray, params: Any, task: Task, query: Query) -> Episode:
-        return rollout(key, env, transformer_policy(network, params), task, query)
-
-    return together(env, episode, in_axes=(0, None, None, None))
-
-
-def play(
-    key: PRNGKeyArray, env: Environment, policy: LoadedPolicy, task: Task, query: Query, num: int
-) -> Episode:
-    """``num`` episodes of a policy on one task, numpy leaves ``[num, ..]``."""
-    keys = jax.random.split(key, num)
-    return fetch(_player(env, policy.config)(keys, policy.params, task, query))

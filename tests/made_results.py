@@ -14,7 +14,7 @@ from envs.maze.env import MazeRunner
 from envs.registry import Judgement, World
 from envs.wrappers import Wrapper
 from experiments.store.results import Results
-from mgpo_jax.runner import Reached
+from mgpo_jax.outcomes import Reached
 
 SIDE = 7
 ENV = MazeRunner(name="tiny", side=SIDE, horizon=6)

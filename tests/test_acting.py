@@ -13,10 +13,10 @@ import envs.episodes
 from envs.errors import UsageError
 from envs.maze.env import MazeRunner
 from mgpo_jax.acting import Actor
+from mgpo_jax.judging import play
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.prompts import Prompt, goals_of, prompt_of
 from mgpo_jax.rollout import Query
-from mgpo_jax.runner import play
 from mgpo_jax.tasks import sample_tasks, task_at
 from mgpo_jax.transformer import GoalTransformer, network_config
 

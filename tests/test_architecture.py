@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import json
 import re
 import subprocess
 import sys
@@ -274,6 +275,17 @@ def test_no_imports_close_a_circle() -> None:
 def test_functions_are_short() -> None:
     faults = [fault for name, tree in sources().items() for fault in long_functions(tree, name)]
     assert len(faults) <= MAX_LONG, faults
+
+
+def test_every_name_is_defined() -> None:
+    """jaxtyping's axes look like undefined names, for which ruff and mypy leave all of these out."""
+    command = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "F821"]
+    places = [ROOT / place for place in (*FLOORS, "tests", "examples")]
+    done = subprocess.run(
+        [*command, "--output-format", "json", *places], capture_output=True, text=True, check=False
+    )
+    undefined = [found["message"].split("`")[1] for found in json.loads(done.stdout)]
+    assert [name for name in undefined if not re.fullmatch(r"[A-Z]|batch|lanes", name)] == []
 
 
 def test_one_module_moves_arrays() -> None:

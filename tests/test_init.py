@@ -419,7 +419,8 @@ def test_a_killed_start_is_in_nobodys_way(here: Path, line: str) -> None:
     check_start(config)
     begin(config, {"init_sha256": hash_file(Path("first/policy/weights.npz"))})
     found = {str(path.relative_to("on")) for path in Path("on").rglob("*") if path.is_file()}
-    copied = {"init/config.json", "init/weights.npz"} if config.init else set()
+    names = ("config.json", "goals.npz", "weights.npz")
+    copied = {f"init/{name}" for name in names} if config.init else set()
     assert found == {"config.json", "meta.json"} | copied
     assert Path("on/init").exists() == bool(config.init)
 

@@ -14,7 +14,7 @@ from conftest import require_kitchen
 import envs
 from envs.kitchen.env import Kitchen
 from experiments import datasets
-from mgpo_jax.runner import together
+from mgpo_jax.lanes import together
 from mgpo_jax.tasks import benchmark_tasks, evaluation_tasks, task_hashes
 
 require_kitchen()

@@ -23,7 +23,7 @@ from experiments.pages.build import SCRIPTS, Bundle, as_text
 from experiments.pages.packing import packed
 from experiments.pages.plans import plan_of
 from experiments.store.results import Results, load_results
-from mgpo_jax.runner import Reached
+from mgpo_jax.outcomes import Reached
 
 ROOT = Path(__file__).parents[1]
 PLAN = {"rehearse": 0, "steer": 0}

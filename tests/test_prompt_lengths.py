@@ -14,7 +14,7 @@ from experiments import prompt_lengths
 from experiments.prompt_lengths import Length, as_table, best_goals, by_length, draw_prompts
 from experiments.store.results import Results, load_results
 from experiments.store.statistics import SeedSpread
-from mgpo_jax.runner import Uncertainty
+from mgpo_jax.judging import Uncertainty
 
 PUBLISHED = Path("results/maze15/ucb").absolute()
 NUM_TASKS = 3

@@ -17,24 +17,16 @@ from envs.gridworld.env import GridWorld
 from envs.maze.env import MazeRunner
 from envs.registry import Judgement
 from envs.wrappers import Noisy, Wrapper
-from mgpo_jax import runner
+from mgpo_jax import judging, runner
 from mgpo_jax.adaptation import Adapter
 from mgpo_jax.distributions import Categorical
+from mgpo_jax.judging import evaluate, evaluate_fully, play, uncertainty
+from mgpo_jax.lanes import cache_bytes, lanes_together, lay_out
 from mgpo_jax.methods import GCBC, UCB, Method, NoHyper, UcbHyper
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.prompts import Prompt, single_goal
 from mgpo_jax.rollout import Query, rollout
-from mgpo_jax.runner import (
-    _lay_out,
-    adapt,
-    cache_bytes,
-    evaluate,
-    evaluate_fully,
-    lanes_together,
-    play,
-    sweep,
-    uncertainty,
-)
+from mgpo_jax.runner import adapt, sweep
 from mgpo_jax.settings import NotNegative
 from mgpo_jax.tasks import sample_tasks, task_at
 from mgpo_jax.transformer import GoalTransformer, network_config
@@ -187,7 +179,7 @@ def test_a_world_may_ask_for_company():
     alone = lanes_together(MAZE, memory)
     assert lanes_together(InGroups(MAZE, 1), memory) == alone
     assert lanes_together(InGroups(MAZE, alone + 5), memory) == alone + 5
-    assert _lay_out(InGroups(MAZE, 1000), 60, memory).group == 60 // jax.device_count()
+    assert lay_out(InGroups(MAZE, 1000), 60, memory).group == 60 // jax.device_count()
 
 
 def test_groups_are_as_large_as_what_their_agents_remember():
@@ -598,8 +590,8 @@ def test_a_head_without_entropy_leaves_it_unknown(monkeypatch, tasks):
     monkeypatch.setattr(Categorical, "entropy", none)
     prompts = jax.vmap(lambda task: single_goal(MAZE.task_goal(task), 3))(tasks)
     query = Query(prompts, jnp.zeros(len(tasks.goal), bool))
-    runner._uncertainty.cache_clear()
+    judging._uncertainty.cache_clear()
     found = uncertainty(MAZE, untrained(MAZE), tasks, jax.tree.map(lambda leaf: leaf[None], query))
-    runner._uncertainty.cache_clear()
+    judging._uncertainty.cache_clear()
     assert np.isnan(found.entropy).all()
     assert np.isfinite(found.return_).all()

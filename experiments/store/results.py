@@ -35,7 +35,7 @@ from experiments.store.summary import ADAPT_AGAIN, read_summary
 from mgpo_jax.archives import LARGEST, ArrayField, Sizes, array_names, read_arrays
 from mgpo_jax.files import new_folder, write_arrays, write_json
 from mgpo_jax.methods import METHODS
-from mgpo_jax.runner import Outcome, Reached
+from mgpo_jax.outcomes import Outcome, Reached
 from mgpo_jax.schema import STRICT, Json, Name, checked_entry, read_document
 from mgpo_jax.settings import Count, Finite, NotNegative, NumEpisodes, NumSeeds, Seed
 from mgpo_jax.tasks import save_tasks, task_arrays, task_at, tasks_from

@@ -44,7 +44,7 @@ from mgpo_jax.files import (
 from mgpo_jax.schema import Json, read_document
 
 CONFIG, META, CHECKPOINTS, POLICY = "config.json", "meta.json", "checkpoints", "policy"
-PICTURE, WEIGHTS = "training.png", "weights.npz"
+PICTURE, WEIGHTS, GOALS = "training.png", "weights.npz", "goals.npz"
 OLD_PARTIAL = "config.json.partial"  # what older versions were writing when they were killed
 PROLONGED = "prolonged_after"  # the entry of META with the steps after which a run took more
 ROOM = 32 << 20  # bytes that must be free before a training starts: a few small checkpoints
@@ -90,7 +90,7 @@ def check_start(config: PretrainConfig) -> None:
 def _holds_nothing(folder: Path) -> bool:
     """Whether a folder holds only what a run leaves behind that was killed before it began."""
     own = {LOCK, META, OLD_PARTIAL}
-    if (folder / META).is_file() and _holds_only(folder / INIT, {WEIGHTS, CONFIG}):
+    if (folder / META).is_file() and _holds_only(folder / INIT, {WEIGHTS, CONFIG, GOALS}):
         own.add(INIT)  # which is written after META
     return _holds_only(folder, own)
 

@@ -36,7 +36,7 @@ PLACES: tuple[tuple[str, str, Any], ...] = (
     ("experiments.datasets", "program_of", begin),
     EVALUATION,
     ("mgpo_jax.training", "Trainer.step", begin),
-    ("mgpo_jax.runner", "_lay_out", begin),
+    ("mgpo_jax.runner", "lay_out", begin),
     ("experiments.evaluation", "evaluate_fully", begin),
     ("experiments.checking", "officials_of", lambda cases: ()),  # mazes have no official program
     ("experiments.checking", "compare", begin),

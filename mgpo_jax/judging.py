@@ -1,0 +1,199 @@
+"""Episodes of a policy under given prompts: how good they are, how sure it was, or what it did in them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from envs.base import Environment, Episode, Task
+from envs.errors import DataError, NotAvailableError
+from mgpo_jax.adaptation import (
+    Judged,
+    achieved_goals,
+    judge,
+)
+from mgpo_jax.lanes import Grid, Lanes, Layout, cache_bytes, lay_out, over_lanes, together
+from mgpo_jax.policy import LoadedPolicy, check_fits, transformer_policy
+from mgpo_jax.rollout import Query, rollout
+from mgpo_jax.sharding import fetch, replicate, split
+from mgpo_jax.transformer import GoalTransformer, TransformerConfig
+
+
+def evaluate(
+    env: Environment,
+    policy: LoadedPolicy,
+    tasks: Task,
+    queries: Query,
+    *,
+    episodes: int,
+    seed: int = 0,
+) -> tuple[np.ndarray, int]:
+    """Mean returns ``[S, N]`` of queries with leaves ``[S, N, ..]``, one for each seed and task.
+
+    The second result is how many episodes a broken world ended. ``evaluate_fully`` tells more.
+
+    Raises:
+      DataError: if the policy was made for another world, or a return is not finite.
+    """
+    judged = evaluate_fully(env, policy, tasks, queries, episodes=episodes, seed=seed)
+    return np.asarray(judged.return_), int(judged.num_failed.sum())
+
+
+def evaluate_fully(
+    env: Environment,
+    policy: LoadedPolicy,
+    tasks: Task,
+    queries: Query,
+    *,
+    episodes: int,
+    seed: int = 0,
+) -> Judged:
+    """Judge queries in fresh episodes.
+
+    Args:
+      env: the world.
+      policy: who acts.
+      tasks: N tasks, stacked.
+      queries: with leaves ``[S, N, ..]``, one for each seed and task.
+      episodes: how many each query is judged in.
+      seed: seed of the episodes.
+
+    Returns:
+      Numpy arrays: ``return_`` [S, N], ``num_failed`` [S, N] and, in worlds with M named goals,
+      ``achieved`` [S, N, M].
+
+    Raises:
+      DataError: if the policy was made for another world, or a return is not finite.
+    """
+    run = partial(_measurement, num_episodes=episodes)
+    return _of_queries(run, env, policy, tasks, queries, seed)
+
+
+class Uncertainty(NamedTuple):
+    """How sure a policy was of its actions in its own episodes."""
+
+    entropy: Float[Array, "*batch"]
+    """Of the distributions that it acted from, in nats, mean over the steps of the episode; NaN where the
+    policy's head has no closed form of it."""
+    return_: Float[Array, "*batch"]
+    num_steps: Int[Array, "*batch"]
+
+
+def uncertainty(
+    env: Environment, policy: LoadedPolicy, tasks: Task, queries: Query, *, seed: int = 0
+) -> Uncertainty:
+    """How sure a policy is of its actions under each query, in one fresh episode of it.
+
+    Args:
+      env: the world.
+      policy: who acts.
+      tasks: N tasks, stacked.
+      queries: with leaves ``[S, N, ..]``.
+      seed: seed of the episodes.
+
+    Returns:
+      Numpy arrays [S, N].
+
+    Raises:
+      DataError: if the policy was made for another world, or a return is not finite.
+    """
+    return _of_queries(_uncertainty, env, policy, tasks, queries, seed)
+
+
+@cache
+def _uncertainty(env: Environment, network: TransformerConfig, layout: Layout) -> Any:
+    """``((lanes, queries), params) -> uncertainty``, compiled once a process."""
+
+    def measure(own: tuple[Lanes, Query], params: Any) -> Uncertainty:
+        lane, query = own
+        done = rollout(lane.key, env, transformer_policy(network, params), lane.task, query)
+        # One pass over the whole episode gives the same distributions as the steps did.
+        episode = done.trajectory
+        distribution: Any = GoalTransformer(network).apply(
+            params, query.prompt, episode.obs, episode.actions
+        )
+        real = jnp.arange(len(episode.obs)) < episode.length
+        try:
+            entropy = jnp.sum(jnp.where(real, distribution.entropy(), 0.0)) / episode.length
+        except NotAvailableError:
+            entropy = jnp.float32(jnp.nan)
+        return Uncertainty(entropy, done.return_, episode.length)
+
+    return over_lanes(env, layout, measure)
+
+
+def _of_queries(
+    program: Callable,
+    env: Environment,
+    policy: LoadedPolicy,
+    tasks: Task,
+    queries: Query,
+    seed: int,
+) -> Any:
+    """What a program finds for queries with leaves ``[S, N, ..]``, as numpy arrays with these axes.
+
+    ``program(env, network, layout)`` is a function ``((lanes, queries), params) -> found`` over all lanes;
+    what it finds has a field ``return_``.
+    """
+    check_fits(policy.config, env.spec)
+    seeds, num = queries.prompt.mask.shape[:2]
+    grid = Grid(variants=1, seeds=seeds, tasks=num)
+    layout = lay_out(env, grid.size, cache_bytes(policy.config))
+    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), queries)
+    index = np.arange(layout.num_lanes) % grid.size
+    own = (
+        grid.lanes(layout, tasks, seed, {}),
+        jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], flat),
+    )
+    run = program(env, policy.config, layout)
+    found = fetch(run(split(layout.mesh, own), replicate(layout.mesh, policy.params)))
+    found = jax.tree.map(lambda rows: grid.shape(rows)[0], found)
+    if not (finite := np.isfinite(found.return_)).all():
+        which, task = np.argwhere(~finite)[0]
+        raise DataError(
+            f"a return on task {task} with seed number {which} is {found.return_[which, task]}; the world "
+            "or the policy is broken"
+        )
+    return found
+
+
+@cache
+def _measurement(
+    env: Environment, network: TransformerConfig, layout: Layout, num_episodes: int
+) -> Any:
+    """``((lanes, queries), params) -> judged``, compiled once a process."""
+
+    def measure(own: tuple[Lanes, Query], params: Any) -> Judged:
+        lane, query = own
+        policy = transformer_policy(network, params)
+
+        def episode(key: PRNGKeyArray) -> tuple[Array, Array, Array | None]:
+            done = rollout(key, env, policy, lane.task, query)
+            achieved = achieved_goals(env, done.trajectory)
+            return done.return_, jnp.asarray(done.failed), achieved
+
+        return judge(*jax.lax.map(episode, jax.random.split(lane.key, num_episodes)))
+
+    return over_lanes(env, layout, measure)
+
+
+@cache
+def _player(env: Environment, network: TransformerConfig) -> Any:
+    def episode(key: PRNGKeyArray, params: Any, task: Task, query: Query) -> Episode:
+        return rollout(key, env, transformer_policy(network, params), task, query)
+
+    return together(env, episode, in_axes=(0, None, None, None))
+
+
+def play(
+    key: PRNGKeyArray, env: Environment, policy: LoadedPolicy, task: Task, query: Query, num: int
+) -> Episode:
+    """``num`` episodes of a policy on one task, numpy leaves ``[num, ..]``."""
+    keys = jax.random.split(key, num)
+    return fetch(_player(env, policy.config)(keys, policy.params, task, query))
