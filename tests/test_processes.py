@@ -21,7 +21,7 @@ from envs.errors import UsageError
 from experiments import joining, signals
 from experiments.datasets import _as_one
 from experiments.joining import Joined, check_flags
-from mgpo_jax import processes, runner, sharding
+from mgpo_jax import lanes, processes, runner, sharding
 from mgpo_jax.methods import UCB
 from mgpo_jax.processes import DisagreementError, Door, Member, Team, connected
 from mgpo_jax.runner import sweep
@@ -223,7 +223,8 @@ def test_no_collective_joins_devices_of_one_process(monkeypatch: pytest.MonkeyPa
         return run
 
     monkeypatch.setattr("mgpo_jax.training.on_devices", on_devices)
-    monkeypatch.setattr(runner, "on_devices", on_devices)
+    for module in (lanes, runner):
+        monkeypatch.setattr(module, "on_devices", on_devices)
     trainer = Trainer(CONFIG, NETWORK, DATASET, sharding.device_mesh(2))
     trainer.step(trainer.init(), parts_of(4))
     assert len(compiled) == 4  # to unpack, to add for each of two parts, to pack

@@ -17,7 +17,7 @@ from envs.gridworld.env import GridWorld
 from envs.maze.env import MazeRunner
 from envs.registry import Judgement
 from envs.wrappers import Noisy, Wrapper
-from mgpo_jax import judging, runner
+from mgpo_jax import judging, lanes, runner
 from mgpo_jax.adaptation import Adapter
 from mgpo_jax.distributions import Categorical
 from mgpo_jax.judging import evaluate, evaluate_fully, play, uncertainty
@@ -157,7 +157,7 @@ def test_variants_differ(swept):
 
 def test_groups_do_not_matter(maze_run, swept, monkeypatch):
     """Not even when lanes have to be made up to fill the last group."""
-    monkeypatch.setattr(runner, "lanes_together", lambda env, memory_bytes: 4)
+    monkeypatch.setattr(lanes, "lanes_together", lambda env, memory_bytes: 4)
     for small, outcome in zip(maze_run(VARIANTS), swept, strict=True):
         assert small.num_episodes >= outcome.num_episodes
         assert_same(small._replace(num_episodes=outcome.num_episodes), outcome)
