@@ -205,5 +205,4 @@ def test_finetuning_from_nothing_balances_the_pole(method: str, hyper: Any, leas
     done = mgpo_jax.adapt(
         BALANCE, policy, tasks, method, hyper=hyper, seeds=2, episodes=400, eval_every=400
     )
-    print(method, done.returns.reshape(2, 8, 50).mean(axis=2))
     assert done.returns[..., -100:].mean() > least > 1.5 * done.returns[..., :20].mean()
