@@ -334,6 +334,16 @@ def test_a_map_without_room_still_adapts(tasks):
     assert np.isfinite(returns).all()
 
 
+def test_beyond_a_full_map_prompts_are_those_of_the_best_episode(tasks, finals):
+    """Few of the cells on the ways fit in; the best episode still leads on."""
+    optimum = np.asarray(jax.vmap(WORLD.optimal_return)(tasks))
+    result, returns = adapted(tasks, num_states=6, num_episodes=60)
+    gained = returns - np.asarray(result.log.returns)[:, 0, 0]
+    assert gained.min() > -1e-5  # the first episode evaluates (g^M)
+    first = optimum - np.asarray(finals[0].log.returns)[:, 0, 0]
+    assert np.mean(optimum - returns) < 0.5 * np.mean(first)
+
+
 def test_prompts_of_one_goal_still_adapt(tasks):
     _, returns = adapted(tasks, policy=compass(num_slots=1), num_episodes=4)
     assert np.isfinite(returns).all()

@@ -8,6 +8,9 @@ After the first episode, which evaluates (g^M), an episode goes to one of three 
   frontier, a state from where the task goal could be reached sooner than by the known way.
 
 The first two act greedily. Without rehearsals (an ablation) they are random prompts of the known way.
+
+A map that is full knows nothing of the states that it has no room for. Where the best episode arrived
+through such states, sooner than any known way does, prompts are drawn from it instead, as in the paper.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from envs.base import EnvSpec, Episode, Goals
 from mgpo_jax.adaptation import in_turn
@@ -76,6 +79,10 @@ class MapState(NamedTuple):
     """The best return of any episode."""
     latest: Goals
     """The goals of the latest episode."""
+    best_goals: Goals
+    """Those of the latest of the best episodes."""
+    best_steps: Int[Array, ""]
+    """How many steps that took to arrive; ``FAR`` if it did not."""
     memory: Memory
     """What the latest search has left."""
     patience: Int[Array, ""]
@@ -120,6 +127,8 @@ def plan_map(
             verified=jnp.int32(FAR),
             best_return=jnp.float32(-jnp.inf),
             latest=no_goals(space.horizon, goal_dim),
+            best_goals=no_goals(space.horizon, goal_dim),
+            best_steps=jnp.int32(FAR),
             memory=no_memory(task_goal, space.num_slots),
             patience=jnp.int32(1),
             wait=jnp.int32(0),
@@ -168,6 +177,12 @@ def _next_query(tools: Tools, key: PRNGKeyArray, state: MapState) -> tuple[Query
             key_search, way.goals, state.task_goal, space.num_slots, space.longest
         )
         found = found._replace(hopeful=Offer(drawn, may_gain))
+    beyond = lies_beyond(state, way)
+    of_best = sample_prompt(
+        key_search, state.best_goals, state.task_goal, space.num_slots, space.longest
+    )
+    hopeful = choose(beyond, Offer(of_best, state.best_steps < state.verified), found.hopeful)
+    found = found._replace(hopeful=hopeful)
     explores, frontier = explore(key_explore, tools, state, way)
     hopes = found.hopeful.exists & (turn % 2 == 0)
     greedy = (turn == 0) | found.sure.exists | hopes
@@ -191,17 +206,25 @@ def _next_query(tools: Tools, key: PRNGKeyArray, state: MapState) -> tuple[Query
     )
 
 
+def lies_beyond(state: MapState, way: Way) -> Bool[Array, ""]:
+    """Whether the best episode arrived sooner than any known way does, since the map has no more room."""
+    is_full = state.table.size == len(state.table.goals)
+    return is_full & (state.best_steps < way.steps)
+
+
 def explore(
     key: PRNGKeyArray, tools: Tools, state: MapState, way: Way
 ) -> tuple[Prompt, Int[Array, ""]]:
     """A prompt to explore with, and the frontier that it leads to (``UNKNOWN`` for none).
 
     It is a random prompt of the known way, or of the latest episode as long as no way is known; in two of
-    four turns it leads to a frontier.
+    four turns it leads to a frontier. Where the best episode lies beyond the map, it is a prompt of that.
     """
     space = tools.space
     key_subset, key_frontier = jax.random.split(key)
+    beyond = lies_beyond(state, way)
     source = choose(way.steps < FAR, way.goals, state.latest)
+    source = choose(beyond, state.best_goals, source)
     subset = sample_prompt(key_subset, source, state.task_goal, space.num_slots, space.longest)
     if not tools.features.frontier:
         return subset, jnp.int32(UNKNOWN)
@@ -214,7 +237,7 @@ def explore(
         prompt = prompt_over(key_subset, space, state.table, state.start, over, task_goal)
         return prompt, over
 
-    wanted = ((state.num_asked // 2) % 2 == 1) & (space.longest > 1)
+    wanted = ((state.num_asked // 2) % 2 == 1) & (space.longest > 1) & ~beyond
     result: tuple[Prompt, Array] = jax.lax.cond(
         wanted, to_frontier, lambda: (subset, jnp.int32(UNKNOWN))
     )
@@ -234,12 +257,14 @@ def _told(tools: Tools, state: MapState, query: Query, episode: Episode) -> MapS
     steps = episode.trajectory
     last = steps.length - 1
     arrives = jnp.all(jnp.abs(steps.achieved_goals[last] - state.task_goal) < SAME)
-    arrived = jnp.where(query.greedy & arrives, steps.length, FAR)
+    arrived = jnp.where(arrives, steps.length, FAR)
     return state._replace(
         table=added,
         start=start,
         prompts=with_result(state.prompts, query, episode.return_),
-        verified=jnp.minimum(state.verified, arrived),
+        verified=jnp.where(query.greedy, jnp.minimum(state.verified, arrived), state.verified),
+        best_goals=choose(improves, steps.goals, state.best_goals),
+        best_steps=jnp.where(improves, arrived, state.best_steps),
         best_return=jnp.maximum(state.best_return, episode.return_),
         latest=steps.goals,
     )
