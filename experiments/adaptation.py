@@ -61,6 +61,12 @@ def adapt_all(
     processes.check_agreed(
         {name: value for name, value in deciding(first, policy, tasks).items() if "sha256" in name}
     )
+
+    def begin() -> None:
+        if processes.is_first():
+            warn_of_goals(env, policy, tasks)
+        expect_compiling()
+
     num_judged = judged_episodes(to_json(first), world)
     assert num_judged is not None
     judged = dataclasses.replace(world.judged, episodes=num_judged)
@@ -78,7 +84,7 @@ def adapt_all(
         keep_actions=first.keep_actions,
         stop_at=first.stop_at,
         journal=journal,
-        begin=expect_compiling,
+        begin=begin,
     )
 
 
@@ -145,8 +151,6 @@ def adapt_and_save(
       DataError: if the folder exists, another process makes it, or a return is not finite.
     """
     settings = deciding(config, policy, tasks)
-    if processes.is_first():
-        warn_of_goals(env, policy, tasks)
     with long_work(folder, settings, provenance(), config.resume) as work:
         (outcome,) = adapt_all(world, env, policy, tasks, [config], work.journal)
         if not processes.is_first():
