@@ -17,6 +17,7 @@ from mgpo_jax.dataset import Dataset
 MOST_KEPT = 1024  # goals that a policy keeps
 MOST_COMPARED = 20_000  # goals of the data that those are chosen of
 MOST_TRAJECTORIES = 5_000  # of the data that are looked at
+AT_ONCE = 128  # goals whose distances to all kept ones are in memory together
 SEED = 0  # of what is drawn from larger data
 EQUAL = 1e-5  # goals that differ by less, relative to the size of goals, are the same
 
@@ -33,8 +34,11 @@ class SeenGoals(NamedTuple):
         rows = np.asarray(goals, np.float64)
         flat = rows.reshape(-1, rows.shape[-1])
         kept = self.goals.astype(np.float64)
-        nearest = [np.linalg.norm(kept - goal, axis=1).min() for goal in flat]
-        return np.asarray(nearest).reshape(rows.shape[:-1])
+        nearest = [
+            np.linalg.norm(block[:, None] - kept, axis=-1).min(axis=1)
+            for block in np.array_split(flat, len(flat) // AT_ONCE + 1)
+        ]
+        return np.concatenate(nearest).reshape(rows.shape[:-1])
 
     def far(self, goals: Any) -> Bool[np.ndarray, "..."]:
         """Which goals ``[..., G]`` are far from all goals of the training."""
@@ -104,10 +108,8 @@ def warning_of_goals(seen: SeenGoals | None, goals: Any, what: str) -> str:
       goals: goals ``[N, G]``, each of one task.
       what: what they are, in the plural.
     """
-    if seen is None:
-        return ""
-    distances = seen.distances(goals)
-    return _sentence(seen, distances, np.asarray(distances > seen.reach), what)
+    alone = np.asarray(goals)[:, None]  # as prompts of one goal
+    return warning_of_prompts(seen, alone, np.ones(alone.shape[:2], bool), what)
 
 
 def warning_of_prompts(seen: SeenGoals | None, goals: Any, mask: Any, what: str) -> str:
@@ -116,10 +118,6 @@ def warning_of_prompts(seen: SeenGoals | None, goals: Any, mask: Any, what: str)
         return ""
     distances = np.where(np.asarray(mask), seen.distances(goals), 0.0)
     far = np.asarray((distances > seen.reach).any(axis=-1))
-    return _sentence(seen, distances, far, what)
-
-
-def _sentence(seen: SeenGoals, distances: np.ndarray, far: np.ndarray, what: str) -> str:
     if not far.any():
         return ""
     return (
