@@ -435,7 +435,7 @@ def _train_and_save(run: Run, go_on: str) -> None:
             state = _take_steps(run, before, metrics, manager, stopping, go_on)
     made = {"env": config.env, "config": to_json(config), "steps": state.step, **run.origin}
     policy = folder / runs.POLICY
-    seen = seen_in(run.fit).joined(run.init.seen_goals if run.init else None)
+    seen = seen_in(run.fit, run.init.seen_goals if run.init else None)
     save_policy(policy, run.network, state.params, made, seen)
     with written(folder / runs.PICTURE) as picture:
         training_curve(metrics.rows).savefig(picture)

@@ -52,10 +52,14 @@ class SeenGoals(NamedTuple):
         return both._replace(reach=max(both.reach, self.reach, other.reach))
 
 
-def seen_in(dataset: Dataset) -> SeenGoals:
+def seen_in(dataset: Dataset, before: SeenGoals | None = None) -> SeenGoals:
     """The goals that prompts of a dataset can hold, those of 5,000 trajectories where there are more.
 
     Those are the goals reached on the way, and the task goals that a trajectory accomplished in hindsight.
+
+    Args:
+      dataset: what a policy is trained on.
+      before: the goals of the training that this one goes on from, which count as well.
     """
     rng = np.random.default_rng(SEED)
     which = np.arange(len(dataset))
@@ -68,7 +72,7 @@ def seen_in(dataset: Dataset) -> SeenGoals:
         reached = [dataset.achieved_goals[s][dataset.goal_reached[s]] for s in steps]
         accomplished = [dataset.outcomes[s] for s in steps]
         found.append(np.unique(np.concatenate([*reached, *accomplished]), axis=0))
-    return covering(np.unique(np.concatenate(found), axis=0))
+    return covering(np.unique(np.concatenate(found), axis=0)).joined(before)
 
 
 def covering(goals: Float[np.ndarray, "M G"]) -> SeenGoals:

@@ -574,5 +574,5 @@ def pretrain(
     made: dict[str, Any] = {"steps": config.steps}
     if init is not None and init.sha256:
         made["init_sha256"] = init.sha256
-    seen = seen_in(dataset).joined(init.seen_goals if init else None)
+    seen = seen_in(dataset, init.seen_goals if init else None)
     return LoadedPolicy(sizes, state.params, made, seen_goals=seen)

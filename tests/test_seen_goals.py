@@ -146,6 +146,8 @@ def test_a_training_that_goes_on_knows_the_goals_of_both() -> None:
     assert len(joined.goals) == 16
     assert not joined.far(GRID).any()
     assert half.joined(None) is half
+    again = seen_in(dataset(GRID[8:], [8]), before=half)
+    np.testing.assert_array_equal(again.goals, other.joined(half).goals)
 
 
 def test_warnings_count_and_say_how_far() -> None:
