@@ -1,4 +1,4 @@
-"""Command lines, what lies on disk, and figures."""
+"""Commands, their results on disk, and figures."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ def _prefer_this_project() -> None:
 
 
 def _leave_quietly() -> None:
-    """Let Ctrl-C end a command while its modules are imported: at once and without a traceback.
+    """Let Ctrl-C end a command at once and without a traceback while its modules are being imported.
 
-    A KeyboardInterrupt in the middle of an import can be swallowed, or leave the interpreter crashing.
+    A KeyboardInterrupt in the middle of an import can be swallowed, or crash the interpreter.
     """
     started = Path(sys.argv[0]) if sys.argv else Path()
     # argv[0] is "-m" until ``python -m`` finds the module.

@@ -1,4 +1,4 @@
-"""The paper's ablations: what is trained, what is adapted, and the lines of the tables."""
+"""The paper's ablations and ours: the trainings and adaptations they need, and their tables."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ from mgpo_jax.methods import UCB, UcbHyper
 from mgpo_jax.policy_files import load_policy
 from mgpo_jax.tasks import test_tasks
 
-EPISODES = 100  # of an adaptation
+EPISODES = 100  # episodes of an adaptation
 GO_ON = "run the same command again to go on"
-UNFINISHED = "unfinished-"  # how folders begin that hold the finished pieces of an adaptation
-LONGEST = 5  # goals of a prompt where the paper varies c
+UNFINISHED = "unfinished-"  # prefix of folders with the finished pieces of an unfinished adaptation
+LONGEST = 5  # maximum number of goals in a prompt where the paper varies c
 
 
 class Line(NamedTuple):
-    """One row of a table: its results, and what the paper has for it."""
+    """A row of a table: its results, and the paper's value."""
 
     label: str
     results: Path
@@ -58,31 +58,34 @@ class Line(NamedTuple):
 
 
 class Part(NamedTuple):
-    """A row of an ablation before it is made."""
+    """The plan of one row of an ablation."""
 
     label: str
+    """Label of the row in our table."""
     name: str
-    """In the paper's table."""
+    """Name of the row in the paper's table."""
     training: PretrainConfig | None
-    """That of its policy; None for the released one."""
+    """Training of its policy; None for the released policy."""
     hyper: Any
     """Hyper-parameters of its method."""
     results: Path
+    """Result folder of its adaptation."""
     together: str
-    """Parts that have this in common are adapted in one program."""
+    """Successive parts with the same value are adapted in one program."""
     method: str = "ucb"
+    """Name of its adaptation method."""
 
 
 def planned(
     config: ReproduceConfig, label: str, demonstrator: str | None = None, **changes: Any
 ) -> PretrainConfig:
-    """The settings of one training, its folder among them.
+    """The settings of one training, including its run folder.
 
     Args:
       config: settings of the command.
-      label: what the run's folder is named after, beside its size.
-      demonstrator: whose dataset (default: that of the world's recipe).
-      **changes: what else differs from the world's ``PretrainConfig``.
+      label: first part of the folder's name.
+      demonstrator: demonstrator of the dataset (default: that of the world's preset).
+      **changes: other changes to the world's ``PretrainConfig``.
     """
     fast = pretrain_preset(config.world, "fast")
     settings = replace(
@@ -97,7 +100,7 @@ def planned(
 
 
 def trained(settings: PretrainConfig) -> Path:
-    """The policy of one training, which is run or continued if it is not finished."""
+    """Run or continue a training unless it is finished; returns the folder of its policy."""
     folder = settings.folder
     if not runs.is_finished(folder):
         print(f"training {folder}", file=sys.stderr)
@@ -111,13 +114,13 @@ def adapted(
     folders: Mapping[Path, Any],
     method: str = "ucb",
 ) -> None:
-    """A method with each variant of its settings, as one program; finished results stay as they are.
+    """Adapt with each variant of a method's hyper-parameters in one program; finished results are kept.
 
     Args:
       config: settings of the command.
       policy_folder: folder of the policy; None for the released one.
       folders: result folders to write, with the hyper-parameters of each.
-      method: who adapts.
+      method: name of the adaptation method.
     """
     world, env = envs.find(config.world), envs.make(config.world)
     policy = load_policy(world, policy_folder)
@@ -136,7 +139,7 @@ def adapted(
     ]
     for folder in filter(Path.exists, folders):
         check_weights(load_results(folder, ()), policy, f"remove {folder}")
-    # All of them, whether they are there or not, so that a stop between two of them changes nothing.
+    # All variants count, finished or not, so that an interruption between two of them changes nothing.
     variants = {"variants": [deciding(settings, policy, tasks) for settings in configs]}
     mark = hashlib.sha256(json.dumps(variants).encode()).hexdigest()[:12]
     pieces = configs[0].folder.parent / f"{UNFINISHED}{mark}"
@@ -155,7 +158,7 @@ def adapted(
 
 
 def table4(config: ReproduceConfig) -> list[Part]:
-    """Longest prompt K and exploration constant c, with the released policy (Table 4)."""
+    """The maximum prompt length K and the exploration constant c, with the released policy (Table 4)."""
     world = envs.find(config.world)
 
     def part(label: str, name: str, hyper: UcbHyper, together: str) -> Part:
@@ -174,7 +177,7 @@ def table4(config: ReproduceConfig) -> list[Part]:
 
 
 def chosen(config: ReproduceConfig, names: Sequence[str]) -> Sequence[str]:
-    """Those of ``names`` that ``--only`` leaves."""
+    """The ``names`` that ``--only`` selects; all of them if it is not given."""
     for name in config.only:
         if name not in names:
             raise nearest(name, names, f"row of {config.what}")
@@ -187,7 +190,7 @@ def compared(
     training_of: Callable[[str], PretrainConfig],
     label: str = "{}",
 ) -> list[Part]:
-    """One policy, and one adaptation with it, for each of the names that ``--only`` leaves."""
+    """The parts of an ablation that trains a policy for each name that ``--only`` selects."""
     hyper, parts = UCB.hyper_in(envs.find(config.world)), []
     for name in chosen(config, names):
         training = training_of(name)
@@ -202,10 +205,10 @@ def demonstrators(config: ReproduceConfig) -> list[str]:
 
 
 def table5(config: ReproduceConfig) -> list[Part]:
-    """One policy for each dataset (Table 5).
+    """A policy for each demonstrator's dataset (Table 5).
 
     Raises:
-      NotAvailableError: for a world with one demonstrator.
+      NotAvailableError: for a world with fewer than two demonstrators.
     """
     names = demonstrators(config)
     if len(names) < 2:
@@ -217,7 +220,7 @@ def table5(config: ReproduceConfig) -> list[Part]:
 
 
 def figure8(config: ReproduceConfig) -> list[Part]:
-    """One policy for each longest prompt K (Figure 8)."""
+    """A policy for each maximum prompt length K (Figure 8)."""
     first = demonstrators(config)[0]
     return compared(
         config,
@@ -228,7 +231,7 @@ def figure8(config: ReproduceConfig) -> list[Part]:
 
 
 def heads(config: ReproduceConfig) -> list[Part]:
-    """One policy for each distribution of continuous actions; the authors' code has the fixed Gaussian.
+    """A policy for each distribution of continuous actions; the authors' code uses the fixed Gaussian.
 
     Raises:
       NotAvailableError: for a world with discrete actions.
@@ -243,10 +246,11 @@ def heads(config: ReproduceConfig) -> list[Part]:
 
 
 def plan(config: ReproduceConfig) -> list[Part]:
-    """The own optimizer without one of the things that it makes use of, beside UCB (not in the paper).
+    """Our optimizer ``plan`` without one of its parts each, and UCB (not in the paper).
 
     Raises:
-      NotAvailableError: for a world whose goals are no states, where it makes use of none of them.
+      NotAvailableError: for a world in which these parts are not used: one with continuous actions, or
+        whose goals are not states.
     """
     spec = envs.make(config.world).spec
     if not (spec.goals_are_states and spec.discrete):
@@ -282,10 +286,10 @@ PLANS: dict[str, Callable[[ReproduceConfig], list[Part]]] = {
 
 
 def make(config: ReproduceConfig) -> list[Line]:
-    """Train and adapt what is missing of an ablation; returns the rows of its table.
+    """Run the missing trainings and adaptations of an ablation; returns the rows of its table.
 
     Raises:
-      UsageError: for a row that it does not have, or a world that it is not of.
+      UsageError: for an unknown row, or a world in which the ablation is not available.
     """
     lines = []
     for _, group in groupby(PLANS[config.what](config), key=lambda part: part.together):
@@ -303,13 +307,13 @@ def make(config: ReproduceConfig) -> list[Line]:
 
 
 def files_of(config: ReproduceConfig) -> tuple[Path, Path]:
-    """Where the table and the curves of an ablation are written."""
+    """The files of an ablation's table and learning curves."""
     place = config.folder / config.what
     return place.with_name(f"{config.what}.md"), place.with_name(f"{config.what}.png")
 
 
 def as_table(lines: Sequence[Line]) -> str:
-    """The table in Markdown, one row for each line."""
+    """The table in Markdown, with a row for each line."""
     head = ["", "initial", "final (mean ± std over seeds)", "regret", "after 40", "paper: final"]
     rows = []
     for line in lines:

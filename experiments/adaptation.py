@@ -1,4 +1,4 @@
-"""Adaptations as results on disk: choosing tasks, running a method, summarizing, saving."""
+"""Run adaptations and save their results: choose tasks, run a method, summarize, write."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from mgpo_jax.tasks import evaluation_tasks, load_tasks, task_arrays, test_tasks
 def chosen_tasks(
     world: World, env: Environment, path: Path | None, validation: bool, validation_seed: int = 0
 ) -> Task:
-    """A user's tasks, the world's test tasks, or as many others."""
+    """The tasks to adapt to: validation tasks, a user's tasks, or the world's test tasks."""
     if validation:
         num = world.num_test_tasks
         return evaluation_tasks(env, num, num, seed=validation_seed)
@@ -53,9 +53,9 @@ def adapt_all(
     configs: Sequence[AdaptConfig],
     journal: Journal | None = None,
 ) -> list[Outcome]:
-    """One outcome for each config; they may differ in the method's hyper-parameters only.
+    """Adapt with each config; returns one outcome for each.
 
-    What is finished is kept in ``journal``.
+    The configs may only differ in the method's hyper-parameters. Finished pieces are kept in ``journal``.
     """
     first = configs[0]
     processes.check_agreed(
@@ -92,20 +92,21 @@ NOT_DECIDING = (
     "config", "debug", "dry_run", "figures", "json", "out", "policy", "quiet", "resume", "sweep", "tasks",
     *OF_PROCESSES,
 )  # fmt: skip
-"""Settings of the command that do not decide about its results, or whose content is hashed instead."""
+"""Settings that do not affect results, or whose content is hashed instead."""
 ADDED = ("obs_noise", "action_noise", "stop_at")
-"""Settings that count where they are given: work that was begun before there were these goes on."""
+"""Settings that were added later. They only count if they are not at their defaults, so that work begun
+before they existed can be continued."""
 
 
 def warn_of_goals(env: Environment, policy: LoadedPolicy, tasks: Task) -> None:
-    """Say on stderr if task goals lie far from the goals that the policy was trained on."""
+    """Warn on stderr if task goals are far from the goals that the policy was trained on."""
     goals = np.asarray(jax.vmap(env.task_goal)(tasks))
     if text := warning_of_goals(policy.seen_goals, goals, "task goals"):
         print(f"warning: {text}", file=sys.stderr)
 
 
 def deciding(config: AdaptConfig, policy: LoadedPolicy, tasks: Task) -> dict[str, Any]:
-    """Everything that decides about the results of an adaptation, as JSON values."""
+    """All settings and hashes that determine the results of an adaptation, as JSON values."""
     settings = {k: v for k, v in to_json(config).items() if k not in NOT_DECIDING}
     for name in ADDED:
         if settings[name] == getattr(AdaptConfig, name):
@@ -115,11 +116,11 @@ def deciding(config: AdaptConfig, policy: LoadedPolicy, tasks: Task) -> dict[str
 
 
 def finished(folder: Path, config: AdaptConfig, policy: LoadedPolicy, tasks: Task) -> Results:
-    """The results of an adaptation that was finished before ``--resume`` was given.
+    """Load the results of an adaptation that was finished before ``--resume`` was given.
 
     Raises:
-      UsageError: if they are of other settings or tasks.
-      DataError: if a file is damaged, or they were found with other weights.
+      UsageError: if they were made with other settings or tasks.
+      DataError: if a file is damaged, or they were made with other weights.
     """
     remove_leftovers(folder, PIECES)
     results = load_results(folder)
@@ -142,12 +143,13 @@ def adapt_and_save(
     policy: LoadedPolicy,
     tasks: Task,
 ) -> Results | None:
-    """Adapt to all tasks as an ``AdaptConfig`` says, and write the results to a new folder.
+    """Adapt to all tasks as ``config`` says, and write the results to a new folder.
 
-    Of several processes that adapt together, process 0 has the results.
+    Returns:
+      The results; None in processes other than 0.
 
     Raises:
-      UsageError: if there is unfinished work that ``--resume`` does not ask for or that has other settings.
+      UsageError: if there is unfinished work, and ``--resume`` is not given or the settings differ.
       DataError: if the folder exists, another process makes it, or a return is not finite.
     """
     settings = deciding(config, policy, tasks)
@@ -177,8 +179,8 @@ def save_outcome(
         write_results(place, results, folder, meta)
 
 
-def _idle(results: Results) -> int:
-    """How many episodes of a search and its judgements were not run since the search had ended."""
+def _count_idle_episodes(results: Results) -> int:
+    """The number of search and evaluation episodes that were not run because a search had stopped early."""
     used = results.episodes_used
     if used is None:
         return 0
@@ -191,13 +193,13 @@ def _idle(results: Results) -> int:
 def results_with_summary(
     config: AdaptConfig, env: Environment, policy: LoadedPolicy, tasks: Task, outcome: Outcome
 ) -> Results:
-    """The results of an adaptation that was just run, with the numbers that tables show."""
+    """The results of an outcome, with the summary that tables show."""
     optimum = np.asarray(jax.jit(jax.vmap(env.optimal_return))(tasks))
     results = results_of(outcome, to_json(config), env, tasks, optimum)
     summary = summarize(
         results,
         policy_sha256=policy.sha256,
-        num_episodes=outcome.num_episodes - _idle(results),
+        num_episodes=outcome.num_episodes - _count_idle_episodes(results),
         num_failed=outcome.num_failed,
         cpu_seconds=outcome.cpu_seconds,
     )

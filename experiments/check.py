@@ -30,15 +30,15 @@ class CheckConfig(Common):
     """Worlds to check, by name or as module:attribute; or result folders of adaptations, whose worlds are
     compared with their official programs."""
     env: Name | None = None
-    """World to compare with its official program (default: where the prompts were found)."""
+    """The world to compare with its official program (default: the one that the prompts were found in)."""
     policy: Path | None = None
-    """Folder of the policy that the results were found with, where it is no longer at its place."""
+    """Folder of the policy that the results were made with, if it has been moved."""
     out: Path | None = None
-    """Also write what was found to this file."""
+    """JSON file to write the findings to."""
 
 
 def main(config: CheckConfig) -> None:
-    """Check whether worlds keep what every world promises; given result folders, act greedily under their
+    """Check whether worlds satisfy the environment contract; given result folders, act greedily under their
     optimized prompts in a world and in its official program, and compare."""
     if not config.runs:
         raise UsageError(
@@ -54,10 +54,10 @@ def main(config: CheckConfig) -> None:
 
 
 def named_worlds(config: CheckConfig) -> list[str]:
-    """The names and places among what was given; empty where all are result folders.
+    """The worlds to check; empty if only result folders were given.
 
     Raises:
-      UsageError: for a world that is not known, or a mixture.
+      UsageError: for an unknown world, or a mixture of worlds and result folders.
     """
     names = [str(path) for path in config.runs if not os.path.lexists(path) and is_world(str(path))]
     if names and len(names) < len(config.runs):
@@ -72,15 +72,15 @@ def named_worlds(config: CheckConfig) -> list[str]:
 
 
 def is_world(text: str) -> bool:
-    """Whether a word that is no folder names a world."""
+    """Whether an argument that is not a folder names a world."""
     return text in envs.names() or (":" in text and "/" not in text)
 
 
 def check(names: Sequence[str], out: Path | None) -> None:
-    """Check worlds one after the other.
+    """Check worlds one after the other, and print a report of each.
 
     Raises:
-      DataError: if one of them has a fault, after the reports.
+      DataError: if any of them has a fault, after all reports.
     """
     from experiments.store.provenance import provenance
     from mgpo_jax.files import write_json

@@ -21,17 +21,18 @@ class CompareConfig(Common):
     """Settings of ``experiments.compare``."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]] = ()
-    """Result folders of two adaptations or more; each is compared with the first."""
+    """Result folders of two or more adaptations; each is compared with the first."""
     env: Name | None = None
-    """Their world, for a world of your own (module:attribute)."""
+    """Your own world, as module:attribute, if the results are from one."""
     csv: Path | None = None
-    """File to write the return of each task and run to, as comma-separated values."""
+    """CSV file to write the final return of each task and run to."""
     profile: Path | None = None
-    """Picture to draw (.png): the share of tasks in which a run is at least so good, for each "so good"."""
+    """PNG file to draw performance profiles to: the share of tasks and seeds that reach each score."""
 
 
 def main(config: CompareConfig) -> None:
-    """Say task by task how adaptations differ from the first of them, with 95 % intervals."""
+    """Compare the final returns of adaptations with those of the first, paired by task, with 95 %
+    intervals."""
     if len(config.runs) < 2:
         found = "".join(printable(str(folder)) for folder in config.runs) or "none"
         raise UsageError(
@@ -45,7 +46,7 @@ def main(config: CompareConfig) -> None:
             raise UsageError(f"--profile {config.profile} must end in .png")
         refuse_existing_file(config.profile, "--profile")
     if config.env is not None:
-        envs.find(config.env)  # from now on results may name its place
+        envs.find(config.env)  # imports the module, so that the results may name it
     from experiments.pairing import as_csv, as_table, differing
     from experiments.store.results import load_results
 

@@ -1,4 +1,4 @@
-"""Collecting demonstrations, by one process or by several, and writing them as a dataset."""
+"""Collect demonstrations, in one process or in several, and write them as a dataset."""
 
 from __future__ import annotations
 
@@ -35,21 +35,25 @@ from mgpo_jax.progress import Progress
 from mgpo_jax.sharding import fetch
 from mgpo_jax.tasks import benchmark_tasks, task_hashes
 
-SMALLEST_TRAJECTORY = 200  # bytes on disk, to see whether a dataset has a chance to fit
-MAX_TRIES = 20  # at one demonstration
+SMALLEST_TRAJECTORY = 200  # bytes on disk, to tell whether a dataset could fit at all
+MAX_TRIES = 20  # attempts at one demonstration
 BATCH = 250  # episodes at once: enough to fill the vector units, few enough to stay in cache
 
 
 def find_demonstrator(world: World, env: Environment, name: str | None) -> tuple[str, Demonstrator]:
-    """The demonstrator of that name and its name; the world's first for None.
+    """Find a demonstrator of a world.
 
     Args:
-      world: whose demonstrator it is.
-      env: the world, made.
-      name: its name, followed by settings to change, as in ``expert,drop=0.3,shuffle=1``.
+      world: the world's record.
+      env: its environment.
+      name: name of the demonstrator, followed by settings to change, as in ``expert,drop=0.3,shuffle=1``;
+        None for the world's first demonstrator.
+
+    Returns:
+      The demonstrator's full name, and the demonstrator.
 
     Raises:
-      UsageError: if the world has none, or none of that name or with such a setting.
+      UsageError: if the world has no demonstrators, none of that name, or none with these settings.
     """
     known = world.demonstrators(env)
     if not known:
@@ -66,7 +70,7 @@ def find_demonstrator(world: World, env: Environment, name: str | None) -> tuple
 def _configured(
     name: str, demonstrator: Demonstrator, changes: Sequence[str]
 ) -> tuple[str, Demonstrator]:
-    """A demonstrator with changed settings, written as ``name=number``, and its name with them in order."""
+    """Change settings of a demonstrator, written as ``name=number``; returns its new name, and itself."""
     if demonstrator.configured is None:
         raise UsageError(
             f"the demonstrator {name} has no settings to change; leave out {changes[0]!r}"
@@ -100,18 +104,18 @@ class Demonstration(NamedTuple):
     fingerprint: Int[Array, "*batch F"]
     episode: Episode
     variant: Int[Array, "*batch"]
-    """Of the world; the demonstrator names them."""
+    """Index of the world's variant; the demonstrator has the names."""
     return_: Float[Array, "*batch"]
-    """On the task that the trajectory happens to solve."""
+    """Return on the task that the trajectory happens to solve."""
     good: Bool[Array, "*batch"]
-    """Whether to keep it, if its task is no test task."""
+    """Whether to keep the demonstration, unless its task is a test task."""
 
 
 @cache
 def demonstration_program(
     env: Environment, sample_task: Any, agent: Any, judge: Any, variant: Any
 ) -> Any:
-    """``(keys, indices, weights) -> demonstrations``, compiled once a process."""
+    """``(keys, indices, weights) -> demonstrations``, compiled once per process."""
 
     def demonstrate(key: PRNGKeyArray, index: Array, weights: Any) -> Demonstration:
         key_task, key_episode = jax.random.split(key)
@@ -127,7 +131,7 @@ def demonstration_program(
 
 
 def program_of(env: Environment, demonstrator: Demonstrator) -> Any:
-    """The program that demonstrates; the demonstrator's weights enter it as data."""
+    """The compiled program of a demonstrator, whose weights enter it as data."""
     judge = (demonstrator.keeps, demonstrator.hindsight_return)
     return demonstration_program(
         demonstrator.env or env,
@@ -139,7 +143,7 @@ def program_of(env: Environment, demonstrator: Demonstrator) -> Any:
 
 
 class _Attempts:
-    """Numbers of the demonstrations to try next: fresh ones, after those that failed before."""
+    """A queue of the demonstrations to attempt, by index: failed ones first, then new ones."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -153,7 +157,7 @@ class _Attempts:
         return np.concatenate([self.again, new]).astype(np.int32)
 
     def failed(self, indices: np.ndarray) -> None:
-        """Note the ones to try again."""
+        """Queue failed demonstrations for another attempt."""
         self.again = indices
         self.tries.update(indices.tolist())
         if self.tries and (worst := self.tries.most_common(1)[0])[1] >= MAX_TRIES:
@@ -164,7 +168,7 @@ class _Attempts:
 
 
 def _rows(found: Demonstration, hashes: np.ndarray, rows: np.ndarray) -> dict[str, np.ndarray]:
-    """What a dataset keeps of some demonstrations."""
+    """The arrays of a dataset for the demonstrations at ``rows``."""
     episode, trajectory = found.episode, found.episode.trajectory
     real = np.arange(trajectory.goal_reached.shape[1]) < trajectory.length[rows, None]
     steps = {name: np.asarray(array)[rows][real] for name, array in trajectory.steps.items()}
@@ -182,9 +186,9 @@ def _rows(found: Demonstration, hashes: np.ndarray, rows: np.ndarray) -> dict[st
 def _record(
     found: Demonstration, indices: np.ndarray, forbidden: np.ndarray, room: int
 ) -> dict[str, np.ndarray]:
-    """What is kept of a batch of demonstrations: ``room`` of them at most, and what became of the rest.
+    """Record a batch: the demonstrations to keep, at most ``room``, and what became of the others.
 
-    There are as many demonstrations as indices, and after them any number that only fill up a program.
+    The first demonstrations belong to ``indices``; those after them are padding.
     """
     found = jax.tree.map(lambda rows: rows[: len(indices)], found)
     hashes = np.array([hash_task(one) for one in found.fingerprint], np.uint64)
@@ -198,13 +202,13 @@ def _record(
 
 
 OF_TRAJECTORIES = ("lengths", "task_hashes", "last_obs", "variants", "returns")
-"""Arrays of a record with an entry for each demonstration; most others have one for each step."""
+"""Arrays of a record with an entry per demonstration. Those in neither tuple have one per step."""
 COUNTED = ("again", "num_failed", "num_test")
-"""What a record says of the demonstrations that are not kept."""
+"""Entries of a record on the demonstrations that are not kept."""
 
 
-def _of_all(own: dict[str, np.ndarray], room: int) -> dict[str, np.ndarray]:
-    """The records of all processes as one; the others than process 0 only need what it counts."""
+def _combine_processes(own: dict[str, np.ndarray], room: int) -> dict[str, np.ndarray]:
+    """Combine the records of all processes; processes other than 0 only get the lengths and counts."""
     if processes.count() == 1:
         return own
     whole: dict[str, np.ndarray] = {}
@@ -218,7 +222,7 @@ def _of_all(own: dict[str, np.ndarray], room: int) -> dict[str, np.ndarray]:
 
 
 def _as_one(records: Sequence[dict[str, np.ndarray]], room: int) -> dict[str, np.ndarray]:
-    """The record of a batch from those of its parts in order; at most ``room`` demonstrations are kept."""
+    """Concatenate the records of a batch's parts in order; keeps at most ``room`` demonstrations."""
     joined = {
         name: np.concatenate([np.atleast_1d(record[name]) for record in records])
         for name in records[0]
@@ -235,9 +239,9 @@ def _as_one(records: Sequence[dict[str, np.ndarray]], room: int) -> dict[str, np
 
 
 def _own_lanes() -> tuple[np.ndarray, int]:
-    """Which episodes of a batch this process runs, and how many of them count.
+    """The positions in a batch that this process runs, and how many of them count.
 
-    All processes run as many; the last ones of the last process fill up its program.
+    All processes run the same number of episodes; surplus ones at the end are padding.
     """
     each = -(-BATCH // processes.count())
     first = processes.index() * each
@@ -254,9 +258,9 @@ def _batches(
     attempts: _Attempts,
     journal: Journal,
 ) -> Iterator[dict[str, np.ndarray]]:
-    """Records of batches of attempts, until they hold ``num`` demonstrations to keep.
+    """Yield records of batches of attempts until they hold ``num`` demonstrations to keep.
 
-    Several processes divide each batch among them, so that attempts and results stay what they are.
+    Several processes share the work of each batch, so that the results do not depend on their number.
     """
     lanes, num_own = _own_lanes()
     demonstrate = program_of(env, demonstrator)
@@ -268,7 +272,7 @@ def _batches(
             keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), batch), BATCH)
             own, room = indices[lanes], num - num_kept
             found = fetch(demonstrate(keys[lanes], own, demonstrator.weights))
-            record = _of_all(_record(found, own[:num_own], forbidden, room), room)
+            record = _combine_processes(_record(found, own[:num_own], forbidden, room), room)
             journal.write(name, record)
         attempts.failed(record.pop("again"))
         num_new = len(record["lengths"])
@@ -287,10 +291,7 @@ def _batches(
 def collect(
     env: Environment, demonstrator: Demonstrator, num: int, seed: int, num_test_tasks: int
 ) -> tuple[Dataset, dict[str, Any]]:
-    """Demonstrations, none of them of a test task, and facts about them, as ``collected``.
-
-    Several processes that collect together all have them in the end.
-    """
+    """Collect demonstrations as ``collected`` does, and return them in every process."""
     found = collected(env, demonstrator, num, seed, num_test_tasks)
     if processes.count() == 1:
         assert found is not None
@@ -310,21 +311,24 @@ def collected(
     num_test_tasks: int,
     journal: Journal | None = None,
 ) -> tuple[Dataset, dict[str, Any]] | None:
-    """Demonstrations, none of them of a test task, and facts about them; None if process 0 has them.
+    """Collect demonstrations, none of them of a test task.
 
-    Those that are not worth keeping are tried again with another key, so that a demonstrator that goes
-    through all tasks in turn demonstrates each of them equally often, but for the last batch.
+    Failed attempts are repeated with another key, so that a demonstrator that goes through all tasks in
+    turn demonstrates each of them equally often, except in the last batch.
 
     Args:
       env: the world.
-      demonstrator: who demonstrates.
-      num: how many demonstrations to keep.
-      seed: seed of tasks and demonstrator.
-      num_test_tasks: how many tasks of the world are kept for test.
-      journal: where finished batches are kept; those that it holds are not run again.
+      demonstrator: the demonstrator.
+      num: number of demonstrations to keep.
+      seed: random seed of the tasks and the demonstrator.
+      num_test_tasks: number of test tasks of the world.
+      journal: finished batches; those that it holds are not run again.
+
+    Returns:
+      The dataset and facts about it; None in processes other than 0.
 
     Raises:
-      DataError: if the demonstrator fails ``MAX_TRIES`` times at one of them.
+      DataError: if the demonstrator fails ``MAX_TRIES`` times at one task.
     """
     attempts = _Attempts(env.spec.name)
     forbidden = task_hashes(env, benchmark_tasks(env, num_test_tasks))
@@ -376,12 +380,12 @@ def collect_and_save(
 
     Args:
       config: settings of the command.
-      wait: wait for another process that collects the same dataset.
-      go_on: what continues it after a stop, for messages.
+      wait: whether to wait for another process that collects the same dataset.
+      go_on: how to continue after an interruption, for messages.
 
     Raises:
       DataError: if the folder exists, or another process makes it.
-      UsageError: if there is no such demonstrator, or unfinished work that ``--resume`` does not ask for.
+      UsageError: if there is no such demonstrator, or unfinished work without ``--resume``.
     """
     world, env = envs.find(config.env), envs.make(config.env)
     name, demonstrator = find_demonstrator(world, env, config.demonstrator)

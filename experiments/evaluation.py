@@ -1,4 +1,4 @@
-"""Optimized prompts once more: in a world behind noise, or in another world with the same tasks."""
+"""Evaluate optimized prompts once more: under noise, or in another world with the same tasks."""
 
 from __future__ import annotations
 
@@ -32,27 +32,27 @@ from mgpo_jax.seen_goals import warning_of_prompts
 from mgpo_jax.tasks import tasks_from
 
 OFFICIAL: Literal["official"] = "official"
-"""In place of a size: the noise on observations that the world's official program adds by default."""
+"""Stands for the noise on observations that the world's official program adds by default."""
 
 
 class Noise(NamedTuple):
-    """Sizes of the noise on observations and on actions."""
+    """Scales of the noise on observations and on actions."""
 
     obs: float | Literal["official"] = 0.0
     action: float = 0.0
 
     def __str__(self) -> str:
         named = {"observations": self.obs, "actions": self.action}
-        told = (f"{name} {_size_told(size)}" for name, size in named.items() if size)
+        told = (f"{name} {_format_size(size)}" for name, size in named.items() if size)
         return ", ".join(told) or "none"
 
 
-def _size_told(size: float | str) -> str:
+def _format_size(size: float | str) -> str:
     return size if isinstance(size, str) else f"{size:g}"
 
 
 class Case(NamedTuple):
-    """An adaptation, its tasks and policy, and the worlds that its prompts go to."""
+    """An adaptation to evaluate, with its tasks, its policy and the worlds to evaluate it in."""
 
     folder: Path
     result: Results
@@ -60,13 +60,13 @@ class Case(NamedTuple):
     """Name of the world."""
     world: World
     behind: Sequence[tuple[Noise, Environment]]
-    """The world behind each noise."""
+    """Each noise, with the environment that adds it."""
     tasks: Task
     policy: LoadedPolicy
 
 
 def noises(obs: Sequence[float | Literal["official"]], action: Sequence[float]) -> list[Noise]:
-    """What to evaluate under: each size by itself, or none."""
+    """The noises to evaluate under: one for each scale, or a single one of zero without any."""
     of_obs = [Noise(obs=size) for size in obs]
     return of_obs + [Noise(action=size) for size in action] or [Noise()]
 
@@ -77,17 +77,17 @@ def open_case(
     """Read an adaptation, and check that policy, tasks and noise fit the world.
 
     Args:
-      folder: the results.
-      env_name: the world to evaluate in (default: where the prompts were found).
+      folder: its result folder.
+      env_name: the world to evaluate in (default: the one that the prompts were found in).
       sizes: the noises.
-      policy: folder of the policy (default: where it lay when the results were made).
+      policy: folder of the policy (default: the one that the results name).
 
     Raises:
       UsageError: if the method has no prompts, or the world cannot run the tasks or has no such noise.
       DataError: if the results are damaged, or the policy is missing or does not fit.
     """
     if env_name is not None:
-        envs.find(env_name)  # from now on results may name its place
+        envs.find(env_name)  # imports the module, so that the results may name it
     result = load_results(folder)
     if "prompt.goals" not in result.best:
         raise UsageError(f"{folder} is of {result.method}, which has no prompts to evaluate")
@@ -98,10 +98,10 @@ def open_case(
     except DataError:
         if name == result.env:
             raise
-        raise UsageError(_no_such_tasks(name, result.env)) from None
+        raise UsageError(_foreign_tasks_message(name, result.env)) from None
     obs_range = _official_noise(name, env, sizes)
     try:
-        behind = [(noise, _behind(noise, env, obs_range)) for noise in sizes]
+        behind = [(noise, _add_noise(noise, env, obs_range)) for noise in sizes]
     except ValueError as error:
         flag = "--action-noise" if any(noise.action for noise in sizes) else "--obs-noise"
         raise UsageError(f"{flag}: {error}; give another size") from None
@@ -119,7 +119,7 @@ def find_official(name: str, env: Environment) -> Official:
     """The official program of a world.
 
     Raises:
-      UsageError: if it has none, or what that needs is not installed.
+      UsageError: if it has none, or the program's dependencies are not installed.
     """
     make = envs.find(name).official
     if make is None:
@@ -134,10 +134,10 @@ def find_official(name: str, env: Environment) -> Official:
 
 
 def _official_noise(name: str, env: Environment, sizes: Sequence[Noise]) -> tuple[float, ...]:
-    """Half widths of the noise that the official program of a world adds, if any of the noises is that.
+    """Half widths of the observation noise of a world's official program; empty if no noise asks for it.
 
     Raises:
-      UsageError: if there is no such program, or it adds none.
+      UsageError: if there is no such program, or it adds no noise.
     """
     if not any(noise.obs == OFFICIAL for noise in sizes):
         return ()
@@ -149,15 +149,15 @@ def _official_noise(name: str, env: Environment, sizes: Sequence[Noise]) -> tupl
     return official.obs_noise
 
 
-def _behind(noise: Noise, env: Environment, obs_range: tuple[float, ...]) -> Noisy:
-    """A world behind a noise; ``obs_range`` is that of its official program."""
+def _add_noise(noise: Noise, env: Environment, obs_range: tuple[float, ...]) -> Noisy:
+    """The world with noise added; ``obs_range`` has the half widths of its official program's noise."""
     if isinstance(noise.obs, str):
         return Noisy(env, action_noise=noise.action, obs_range=obs_range)
     return Noisy(env, noise.obs, noise.action)
 
 
-def _no_such_tasks(name: str, where: str) -> str:
-    """What is wrong with a world that has other tasks than the one where prompts were found."""
+def _foreign_tasks_message(name: str, where: str) -> str:
+    """The error message for a world whose tasks differ from those that the prompts were found for."""
     home = envs.find(where).home
     fitting = [world.name for world in WORLDS.usable() if world.home == home]
     return (
@@ -167,7 +167,7 @@ def _no_such_tasks(name: str, where: str) -> str:
 
 
 def evaluate_cases(cases: Sequence[Case], episodes: int, seed: int) -> Iterator[dict[str, Any]]:
-    """The optimized prompts of some adaptations, a row for each noise."""
+    """Evaluate the optimized prompts of some adaptations; yields one row for each case and noise."""
     with Progress(sum(len(case.behind) for case in cases), "row") as progress:
         for case in cases:
             for row in _evaluate_case(case, episodes, seed):
@@ -205,12 +205,12 @@ def _evaluate_case(case: Case, episodes: int, seed: int) -> Iterator[dict[str, A
             "change": now.mean - before.mean,
             "failed_episodes": num_failed,
             "num_episodes": returns.size * episodes,
-            **_of_named_goals(env, judged.achieved),
+            **_named_goal_entries(env, judged.achieved),
         }
 
 
-def _of_named_goals(env: Environment, achieved: Any) -> dict[str, Any]:
-    """The entries of a row on named goals, from shares ``[S, N, M]``; none in worlds without names."""
+def _named_goal_entries(env: Environment, achieved: Any) -> dict[str, Any]:
+    """A row's entries on named goals, from success rates ``[S, N, M]``; none in worlds without names."""
     if achieved is None:
         return {}
     shares = dict(zip(env.goal_names, achieved.mean(axis=(0, 1)).tolist(), strict=True))
@@ -218,7 +218,11 @@ def _of_named_goals(env: Environment, achieved: Any) -> dict[str, Any]:
 
 
 def achieved_table(rows: Sequence[dict[str, Any]]) -> str:
-    """Score and share of episodes for each named goal, a column for each row that has them; or nothing."""
+    """The score and the success rate of each named goal, with a column for each row that has them.
+
+    Returns:
+      The table in Markdown, or an empty string if no row has named goals.
+    """
     having = [row for row in rows if "achieved" in row]
     if not having:
         return ""
@@ -237,7 +241,7 @@ HEAD = (
 
 
 def cells(row: dict[str, Any]) -> list[str]:
-    """A row as it is printed."""
+    """The cells of a row in the printed table."""
     return [
         row["folder"],
         row["env"],

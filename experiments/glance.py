@@ -1,4 +1,4 @@
-"""The worlds at a glance (Figure 11): which worlds there are, a task of each, and who acts in it."""
+"""The worlds at a glance (Figure 11): a panel for each world, with a task and its agent."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ SEED = 0
 
 
 def glance_of(world: World, others: Sequence[str] = ()) -> Glance:
-    """A world in one panel: its first task, with an episode of its first demonstrator where one is shown.
+    """The panel of a world: a task, with an episode of the first demonstrator where the world draws one.
 
     Args:
       world: the world.
       others: names of worlds that look the same.
 
     Raises:
-      UsageError: if it is not installed, or draws nothing that stands still.
+      UsageError: if the world is not installed, or draws no still pictures.
     """
     env = envs.make(world.name)
     if world.pictures is None:
@@ -46,7 +46,7 @@ def glance_of(world: World, others: Sequence[str] = ()) -> Glance:
         jax.tree.map(np.asarray, task),
         goal,
         start=lambda: np.asarray(jax.jit(env.reset)(key, task)[1].obs),
-        play=partial(_played, world, env, task),
+        play=partial(_play_episode, world, env, task),
     )
     if draw is None:
         raise UsageError("it draws nothing that stands still")
@@ -58,8 +58,8 @@ def _sentence(text: str) -> str:
     return f"{text[:1].upper()}{text[1:].rstrip('.')}." if text else ""
 
 
-def _played(world: World, env: Environment, task: Task) -> Episode:
-    """An episode of the world's first demonstrator, with numpy leaves."""
+def _play_episode(world: World, env: Environment, task: Task) -> Episode:
+    """Run an episode of the world's first demonstrator; returns it with numpy leaves."""
     _, demonstrator = find_demonstrator(world, env, None)
 
     def episode(key: jax.Array, task: Task, weights: Any) -> Episode:
@@ -71,9 +71,9 @@ def _played(world: World, env: Environment, task: Task) -> Episode:
 
 
 def worlds_together(names: Sequence[str]) -> list[tuple[World, list[str]]]:
-    """The worlds of some names, one of those that share tasks and looks, with the names of the others.
+    """Group worlds that share their tasks and looks: the first of each group, and the names of the others.
 
-    A world that cannot be imported is left out with a line on stderr.
+    A world that cannot be imported is left out, with a line on stderr.
     """
     found: dict[str, tuple[World, list[str]]] = {}
     for name in names:
@@ -94,15 +94,15 @@ def _say_left_out(name: str, error: Exception) -> None:
 
 
 def file_of(config: ReproduceConfig) -> Path:
-    """Where the picture is written."""
+    """The file that the picture is written to."""
     return config.out / "figure11.png"
 
 
 def draw(config: ReproduceConfig) -> Path:
-    """Draw the worlds at a glance, those of ``--env`` or all that are installed; returns the file.
+    """Draw the worlds of ``--env``, or all that are installed; returns the file.
 
     Raises:
-      UsageError: if none of them can be drawn, or a file is there that no command wrote.
+      UsageError: if none of them can be drawn, or the file exists and was not written by a command.
     """
     place = file_of(config)
     check_replaceable([place])
@@ -110,7 +110,7 @@ def draw(config: ReproduceConfig) -> Path:
     for world, others in worlds_together(config.env or WORLDS.names()):
         try:
             glances.append(glance_of(world, others))
-        except (UsageError, ImportError) as error:  # of packages that are missing, or of OpenGL
+        except (UsageError, ImportError) as error:  # a package, or OpenGL, is missing
             _say_left_out(world.name, error)
     if not glances:
         raise UsageError("there is no figure11: none of the worlds can be drawn")

@@ -1,9 +1,9 @@
-"""``--distributed``: one command on several processes, hosts and accelerators.
+"""``--distributed``: run one command on several processes, hosts and accelerators.
 
-Every process runs the same command line. It joins the others after its flags have been checked and before
-anything is computed, by the variables of a scheduler or by ``--coordinator``; never by guess, since
-``salloc`` sets SLURM's variables for a single process, too. From then on only process 0 prints, draws and
-writes. A request to stop reaches all of them, and so does the news that one has failed or is gone.
+Every process runs the same command line. After its flags have been checked and before it computes anything,
+it joins the others, which it finds by the variables of a scheduler or by ``--coordinator``. This happens
+only on request, since ``salloc`` sets SLURM's variables for a single process, too. From then on only
+process 0 prints, draws and writes. If one process is asked to stop, fails or dies, the others are told.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from mgpo_jax.processes import Member
 from mgpo_jax.settings import flag
 
 ARRIVING = 300  # seconds in which all processes must have started
-HEARTBEATS = 100  # seconds without news after which jax gives a process up; we know of it earlier
-LEAVING = 20  # seconds that jax waits for the others at the end, when they have all come to it
-SAME = 2.0  # seconds in which an error that all processes meet arrives in each of them
+HEARTBEATS = 100  # seconds without a sign of life until jax gives up a process; we notice earlier
+LEAVING = 20  # seconds that jax waits for the others at shutdown, when all have reached it
+SAME = 2.0  # seconds within which an error common to all processes occurs in each of them
 PLACE = struct.Struct(">64sQQ16s")  # host, process number, port and password
 GO_ON = {"resume": "go on with --resume", "": "run the same command again"}
 
@@ -42,22 +42,22 @@ class Joined(Common):
     """Flags of the commands that several processes can run together."""
 
     distributed: bool = False
-    """Run on several processes (docs/scale.md): as SLURM, Open MPI or a TPU slice has started them, or as
-    the three flags below say. All of them have the same command line, but for ``--process``."""
+    """Run on several processes (docs/scale.md), started by SLURM, Open MPI or a TPU slice, or described by
+    the next three flags. All need the same command line, except for ``--process``."""
     coordinator: str | None = None
-    """HOST:PORT of process 0, where the others find it."""
+    """Address of process 0 for the others to connect to, as HOST:PORT."""
     processes: Annotated[int, Ge(1), Le(65_536)] | None = None
-    """How many processes there are."""
+    """Total number of processes."""
     process: Annotated[int, Ge(0), Le(65_535)] | None = None
-    """Which of them this one is, counted from 0."""
+    """Index of this process, counted from 0."""
 
 
 OF_PROCESSES = tuple(field.name for field in dataclasses.fields(Joined))[-4:]
-"""The settings above, which change no result."""
+"""The settings above, which do not affect results."""
 
 
 def check_flags(config: Joined) -> None:
-    """Raise ``UsageError`` for flags of several processes that do not go together."""
+    """Raise ``UsageError`` for flags of ``--distributed`` that are missing or contradict each other."""
     given = [name for name in OF_PROCESSES[1:] if getattr(config, name) is not None]
     if given and not config.distributed:
         value = shown(getattr(config, given[0]))
@@ -85,10 +85,10 @@ def check_flags(config: Joined) -> None:
 
 
 def join(config: Joined) -> None:
-    """Become one of several processes, if ``--distributed`` is given; before anything is computed.
+    """Join the other processes if ``--distributed`` is given; must run before anything is computed.
 
     Raises:
-      UsageError: if the flags do not go together, or nothing says who the processes are.
+      UsageError: if the flags contradict each other, or nothing says where the other processes are.
       DataError: if the others do not arrive in time, or were started differently.
     """
     check_flags(config)
@@ -98,7 +98,7 @@ def join(config: Joined) -> None:
     import jax
 
     if jax.process_count() > 1:
-        team = _met(config)
+        team = _connect(config)
         processes.join(team)
         signals.tell_others(
             lambda number: team.tell(processes.SIGNAL, str(number)),
@@ -107,14 +107,14 @@ def join(config: Joined) -> None:
         if team.index:
             sys.stdout = sys.stderr = Silent(sys.stderr)
         processes.check_agreed(_facts(config))
-        print(f"{len(team.members)} processes, {_devices_told()}", file=sys.stderr)
+        print(f"{len(team.members)} processes, {_describe_devices()}", file=sys.stderr)
 
 
 def _start(config: Joined) -> None:
-    """Start jax's own acquaintance of processes."""
+    """Initialize ``jax.distributed``."""
     import jax
 
-    # It would catch SIGTERM; requests to stop are ours to answer (``signals``).
+    # The preemption service would catch SIGTERM; we answer requests to stop ourselves (``signals``).
     jax.config.update("jax_enable_preemption_service", False)
     place: dict[str, Any] = {}
     if config.coordinator is not None:
@@ -149,11 +149,11 @@ def _start(config: Joined) -> None:
         ) from None
 
 
-def _met(config: Joined) -> processes.Team:
-    """The processes, after a first collective over the devices that later ones use.
+def _connect(config: Joined) -> processes.Team:
+    """Exchange addresses in a first collective over all devices, and connect the processes.
 
-    The first one has 30 seconds, and every process must have come to it: so it comes now, before anything
-    that may take longer in one of them.
+    Every process must reach the first collective within 30 seconds. So it comes now, before anything that
+    may take longer in one of them.
     """
     import jax
     import jax.numpy as jnp
@@ -167,7 +167,7 @@ def _met(config: Joined) -> processes.Team:
     host, pid = processes.own_name()
     password, port = (door.password, door.port) if door else (b"", 0)
     own = np.frombuffer(PLACE.pack(host.encode()[:64], pid, port, password), np.uint8)
-    with _unprinted():
+    with _discard_output():
         rows = np.asarray(rows_of_processes(jnp.asarray(own)))
     told = [PLACE.unpack(row.tobytes()) for row in rows]
     members = [
@@ -186,13 +186,13 @@ def _met(config: Joined) -> processes.Team:
         members,
         jax.process_index(),
         links,
-        lambda event, member, text: _heard(event, member, text, told_to_resume),
+        lambda event, member, text: _react(event, member, text, told_to_resume),
     )
 
 
 @contextmanager
-def _unprinted() -> Iterator[None]:
-    """Show nothing of what libraries print, such as Gloo whenever it connects."""
+def _discard_output() -> Iterator[None]:
+    """Discard what libraries print to stdout and stderr, such as Gloo whenever it connects."""
     kept = [(number, os.dup(number)) for number in (1, 2)]
     try:
         with open(os.devnull, "wb") as nothing:
@@ -206,7 +206,7 @@ def _unprinted() -> Iterator[None]:
 
 
 def _facts(config: Joined) -> Mapping[str, Any]:
-    """What all processes must have in common before they begin."""
+    """What all processes must agree on before they begin, by what messages call it."""
     import jax
 
     from experiments.store.provenance import provenance
@@ -226,34 +226,34 @@ def _facts(config: Joined) -> Mapping[str, Any]:
     }
 
 
-def _devices_told() -> str:
+def _describe_devices() -> str:
     import jax
 
     devices = jax.devices()
     return f"{len(devices)} devices ({devices[0].device_kind})"
 
 
-def _heard(event: str, member: Member, text: str, go_on: str) -> None:
-    """React to news of another process; called in a thread of its own."""
+def _react(event: str, member: Member, text: str, go_on: str) -> None:
+    """React to an event in another process; called in a thread of its own."""
     if event == processes.SIGNAL:
         signals.receive(int(text), member.number)
     elif event == processes.FAILED:
         _faults[member.number] = text
-        _failed.wait(SAME)  # perhaps this process meets the same error, and says it itself
+        _failed.wait(SAME)  # this process may meet the same error, and would report it itself
         if not (_failed.is_set() or signals.is_leaving()):
             _end(f"{member} failed: {text}")
     elif not (_failed.is_set() or signals.is_leaving()):
         _end(f"{member} (process number {member.pid} there) is gone; {go_on}")
 
 
-_failed = threading.Event()  # set when this process fails by itself
-_faults: dict[int, str] = {}  # why others have failed, by their numbers
+_failed = threading.Event()  # set when this process fails because of an error of its own
+_faults: dict[int, str] = {}  # error messages of other processes, by their numbers
 
 
 def leave_failed(team: processes.Team, line: str, message: str, code: int) -> NoReturn:
-    """End this process because of an error of its own, and tell the others.
+    """Exit because of an error in this process, and tell the others.
 
-    An error that process 0 meets, too, is printed there only.
+    An error that process 0 meets, too, is only printed there.
     """
     _failed.set()
     team.tell(processes.FAILED, message)
@@ -268,7 +268,7 @@ def leave_failed(team: processes.Team, line: str, message: str, code: int) -> No
 
 
 def _end(text: str) -> NoReturn:
-    """End this process because of another one, with one line."""
+    """Exit because of another process, with a one-line message."""
     try:
         _print(f"error: {printable(text)}")
         clean_up()

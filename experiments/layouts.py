@@ -1,4 +1,4 @@
-"""Ways to divide this machine among processes and devices, measured by starting the bench in each."""
+"""Run the bench on this machine divided among processes and devices in different ways."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FORCED = "--xla_force_host_platform_device_count="
 
 
 def check_layouts(layouts: Sequence[str], distributed: bool) -> None:
-    """Raise ``UsageError`` for what is no layout, or where the processes are started by others."""
+    """Raise ``UsageError`` for words that are not layouts, or if ``--distributed`` is given, too."""
     if distributed:
         raise UsageError("--layouts starts its processes by itself; leave out --distributed")
     for layout in layouts:
@@ -31,12 +31,16 @@ def check_layouts(layouts: Sequence[str], distributed: bool) -> None:
 
 
 def measured(layout: str, words: Sequence[str]) -> list[dict[str, Any]]:
-    """The rows of ``experiments.bench`` with some flags, on the processes and devices of a layout.
+    """The rows that ``experiments.bench`` measures with a layout.
 
-    Where the cores of this machine are enough, each process has cores of its own.
+    If this machine has enough cores, each process is pinned to cores of its own.
+
+    Args:
+      layout: number of processes and devices per process, such as ``2x1``.
+      words: the other flags of the bench.
 
     Raises:
-      DataError: if a process fails; it has said why.
+      DataError: if a process fails; it has printed the reason.
     """
     num, devices = (int(number) for number in layout.split("x"))
     flags = os.environ.get("XLA_FLAGS", "").split()
@@ -80,7 +84,7 @@ def measured(layout: str, words: Sequence[str]) -> list[dict[str, Any]]:
 
 
 def _cores(num: int, devices: int) -> list[set[int]]:
-    """The cores of each process; none where there are too few of them."""
+    """The cores to pin each process to; empty sets if there are too few."""
     if not hasattr(os, "sched_getaffinity"):
         return [set()] * num
     cores = sorted(os.sched_getaffinity(0))

@@ -1,4 +1,4 @@
-"""Adaptations to the same tasks against each other, task by task."""
+"""Compare adaptations to the same tasks with each other, task by task."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from experiments.store.results import Results
 from experiments.store.statistics import SeedSpread, compare
 from experiments.store.tables import table
 
-SAME = 1e-6  # returns of a task that differ by less are equal
+SAME = 1e-6  # returns that differ by at most this count as equal
 HEAD = (
     "run", "method", "final (mean ± std over seeds)", "minus the first [95 %]",
     "better than the first with probability [95 %]", "tasks better / equal / worse",
@@ -24,14 +24,14 @@ FACTS = {
     "policy_sha256": "weights",
     "env": "worlds",
 }
-"""What should be the same in all runs, by its name in ``summary.json``."""
+"""What all runs should have in common: names in ``summary.json``, and what messages call them."""
 
 
 def as_table(runs: Sequence[Path], results: Sequence[Results]) -> str:
-    """One row for each run, in Markdown: its final return, and how it differs from that of the first run.
+    """A Markdown table with a row for each run: its final return, and the difference from the first run.
 
-    Differences are paired by task, and seeds are drawn anew within each task. With one seed there is no
-    interval. Returns of a task are means over seeds.
+    Differences are paired by task, and the bootstrap resamples seeds within each task. With one seed there
+    is no interval. The return of a task is the mean over seeds.
 
     Raises:
       UsageError: for runs on different tasks.
@@ -49,20 +49,20 @@ def as_table(runs: Sequence[Path], results: Sequence[Results]) -> str:
 
 
 def _counts(result: Results, first: Results) -> str:
-    """How many tasks are better, equal and worse."""
+    """The numbers of tasks with a better, an equal and a worse return than in the first run."""
     change = final_returns(result) - final_returns(first)
     counts = np.sum(change > SAME), np.sum(np.abs(change) <= SAME), np.sum(change < -SAME)
     return " / ".join(map(str, counts))
 
 
 def final_returns(result: Results) -> np.ndarray:
-    """The final return of each task, mean over seeds, [N]."""
+    """The final return of each task, averaged over seeds, [N]."""
     means: np.ndarray = result.eval_returns[:, :, -1].mean(axis=0, dtype=np.float64)
     return means
 
 
 def differing(runs: Sequence[Path], results: Sequence[Results]) -> Iterator[str]:
-    """What makes the comparison of some runs unequal, one sentence for each."""
+    """What makes a comparison of some runs unfair, one warning for each fact in which they differ."""
     for name, what in FACTS.items():
         found = [result.summary.get(name) for result in results]
         if len(set(found)) > 1:
@@ -77,7 +77,7 @@ def _short(value: object) -> str:
 
 
 def as_csv(runs: Sequence[Path], results: Sequence[Results]) -> str:
-    """The final return of each task in each run, mean over seeds, with the optimum where it is known."""
+    """The final return of each task in each run, averaged over seeds, and the optimum where it is known."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["task", "optimum", *map(str, runs)])

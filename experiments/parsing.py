@@ -1,11 +1,11 @@
-"""Command lines as checked settings. tyro alone decides what the words mean.
+"""Parse command lines into checked settings. tyro alone decides what the words mean.
 
-Defaults may depend on other flags, as those of ``pretrain`` do on ``--env``. So a command line is parsed
-twice by the same parser: once with the general defaults, to see which other ones it chooses, and once with
-those. No flag may be given twice, so both passes read the same values.
+Defaults may depend on other flags, as those of ``pretrain`` depend on ``--env``. So a command line is
+parsed twice by the same parser: first with the general defaults, to find out which defaults apply, and then
+with those. No flag may be given twice, so both passes read the same values.
 
-Numbers and choices pass through tyro as they were typed. Before settings are made of them, they go through
-the same check as those of library calls, which says what is wrong.
+Invalid numbers and choices pass through tyro as text. Before settings are made of them, they go through the
+same check as those of library calls, which says what is wrong.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from experiments.config_files import expanded
 from mgpo_jax.settings import check_values, flag, is_settings, range_of, types_of
 
 Defaults = Callable[[Any, Sequence[str]], Any]
-"""``(config, flags) -> default config``. The config has what was typed, and general defaults elsewhere.
-``flags`` are those on the command line that it does not know."""
+"""``(config, flags) -> default config``. The config has the values that were typed and general defaults
+elsewhere; ``flags`` are those on the command line that it does not know."""
 
 
 def parse(
@@ -52,12 +52,12 @@ def parse(
     Args:
       config_class: a frozen dataclass of settings.
       argv: the words of the command line.
-      default: what chooses the defaults, where they depend on other flags.
+      default: chooses the defaults, where they depend on other flags.
       description: what the command does, for ``--help``.
-      prog: how the command is called, for messages.
+      prog: name of the program, for messages.
 
     Raises:
-      UsageError: for the first thing that is wrong.
+      UsageError: for the first mistake on the command line.
       SystemExit: after the help was printed.
     """
     words = list(argv)
@@ -83,11 +83,11 @@ def parse(
 
 
 class _Refused(Exception):
-    """A value is refused. (A ``UsageError`` is a ``ValueError``, which tyro would catch and reword.)"""
+    """An invalid value. (``UsageError`` is a ``ValueError``, which tyro would catch and reword.)"""
 
 
 def _read(words: list[str], config_class: type, prog: str, **options: Any) -> tuple[Any, list[str]]:
-    """What tyro makes of a command line, and the words that it does not know."""
+    """The settings that tyro parses from a command line, and the words that it does not know."""
     parsed: Any = tyro.conf.OmitArgPrefixes[config_class]
     said = io.StringIO()
     try:
@@ -109,7 +109,7 @@ def _read(words: list[str], config_class: type, prog: str, **options: Any) -> tu
 
 
 def _condensed(text: str, prog: str) -> str:
-    """A boxed message of tyro as one line, without its colors."""
+    """A boxed error message of tyro as one line without colors."""
     plain = re.sub(r"\x1b\[[0-9;]*m", "", text)
     lines = [line.strip("│ ") for line in plain.splitlines() if line.startswith("│")]
     body = [line for line in lines if not line.startswith("─")]
@@ -129,10 +129,10 @@ def _flag_of(word: str) -> str:
 
 
 def _flags(config: Any) -> dict[str, str]:
-    """Every flag of a config, and the one that stands for it where a setting has several.
+    """Every flag of a config, aliases and ``--no-`` included, mapped to the main flag of its setting.
 
     Raises:
-      UsageError: if two settings have the same flag, which a method of a user can cause.
+      UsageError: if two settings have the same flag, as a user's own method can cause.
     """
     found: dict[str, str] = {}
     for field in dataclasses.fields(config):
@@ -178,7 +178,7 @@ def _check_flags(words: Sequence[str], known: dict[str, str]) -> None:
 
 
 def _refuse_unknown(unknown: Sequence[str], known: Sequence[str], prog: str) -> NoReturn:
-    """Raise ``UsageError`` for words that nothing on the command line takes."""
+    """Raise ``UsageError`` for words that belong to no setting."""
     for word in unknown:
         if word.startswith("--"):
             name = word.partition("=")[0]
@@ -189,7 +189,7 @@ def _refuse_unknown(unknown: Sequence[str], known: Sequence[str], prog: str) -> 
 
 
 def _registry() -> ConstructorRegistry:
-    """How tyro reads and checks the values of settings, and what its help says of their ranges."""
+    """Our rules for tyro: how values are read and checked, and how the help shows their ranges."""
     registry = ConstructorRegistry()
     registry.primitive_rule(_number)
     registry.primitive_rule(_choice)
@@ -215,7 +215,7 @@ def _registry() -> ConstructorRegistry:
 
 
 def _checked(settings_class: type, make: Callable[..., Any], **values: Any) -> Any:
-    """The settings that ``make`` makes of the values, if they are right; else raise ``_Refused``."""
+    """The settings that ``make`` builds from the values; raises ``_Refused`` if one is invalid."""
     try:
         check_values(settings_class, values)
     except UsageError as error:
@@ -224,7 +224,7 @@ def _checked(settings_class: type, make: Callable[..., Any], **values: Any) -> A
 
 
 def _with_range(field: StructFieldSpec) -> StructFieldSpec:
-    """The field, whose help names its range beside its default."""
+    """The field with its range beside its default in the help."""
     text = range_of(field.type)
     if not text:
         return field
@@ -234,7 +234,7 @@ def _with_range(field: StructFieldSpec) -> StructFieldSpec:
 
 
 def _number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    """How tyro reads a number. Text that is no number stays text, for the check to refuse."""
+    """tyro's rule for numbers. Text that is not a number stays text, for the check to refuse."""
     if info.type not in (int, float):
         return None
     kind = info.type
@@ -257,7 +257,7 @@ def _number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
 
 
 def _choice(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    """How tyro reads one of several words. Any other word is kept, for the check to refuse."""
+    """tyro's rule for choices. A word that is not a choice is kept, for the check to refuse."""
     if info.type_origin is not Literal:
         return None
     choices = get_args(info.type)

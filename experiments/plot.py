@@ -20,17 +20,18 @@ class PlotConfig(Common):
     """Settings of ``experiments.plot``."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]] = ()
-    """Result folders of adaptations; those of one world share its figures."""
+    """Result folders of adaptations; those in the same world are drawn together."""
     out: Path = Path("figures")
-    """Folder to write."""
+    """Output folder."""
     tasks: tuple[Index, ...] = ()
-    """Tasks to draw, counted from 0 (default: the four that the first run improved most)."""
+    """Indices of the tasks to draw, counted from 0 (default: the four that the first run improved most)."""
     seed: Index = 0
-    """Which seed of the adaptations to draw, counted from 0."""
+    """Index of the seed to draw, counted from 0."""
     policy: Path | None = None
-    """Folder of the policy that the results were found with, where it is no longer at its place."""
+    """Folder of the policy that the results were made with, if it has been moved."""
     env: Name | None = None
-    """A world of your own that the results name, as module:attribute: files alone import nothing."""
+    """Your own world, as module:attribute, if the results are from one; without it no user code is
+    imported."""
 
 
 def main(config: PlotConfig) -> None:
@@ -38,7 +39,7 @@ def main(config: PlotConfig) -> None:
     require_runs(config.runs, "plot")
     check_place(config.out)
     if config.env is not None:
-        envs.find(config.env)  # from now on results may name its place
+        envs.find(config.env)  # imports the module, so that the results may name it
     from experiments.drawing import by_world, check_together, labeled, pictures_together, write
     from experiments.store.results import load_results
     from experiments.store.seals import check_replaceable

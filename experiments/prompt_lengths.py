@@ -1,7 +1,7 @@
-"""Figure 9 in numbers: how sure the policy is of its actions, and its return, by the length of the prompt.
+"""Figure 9 in numbers: the entropy of the policy's actions and its return, by the length of the prompt.
 
-Prompts of 1, 2, .. K goals are drawn from the best trajectory of each search by the one sampler, as the
-search itself draws new ones, and the policy acts under each in an episode of its own with sampled actions.
+Prompts of 1, 2, .. K goals are drawn from the best trajectory of each search, with the same sampler that
+the search uses, and the policy runs one episode with sampled actions under each.
 """
 
 from __future__ import annotations
@@ -25,20 +25,21 @@ from mgpo_jax.judging import uncertainty
 from mgpo_jax.prompts import Prompt
 from mgpo_jax.rollout import Query
 
-DRAWS = 2  # prompts of each length from each trajectory
+DRAWS = 2  # prompts per length and trajectory
 HEAD = (
     "goals", "prompts", "entropy of an action (mean ± std over seeds)", "return", "steps",
 )  # fmt: skip
 
 
 class Length(NamedTuple):
-    """What prompts of one length make of the policy."""
+    """The behavior of the policy under prompts of one length."""
 
     num_goals: int
     num_prompts: int
     entropy: SeedSpread | None
-    """Of the distribution of one action, in nats; None where the policy's head has no closed form."""
+    """Entropy of the action distribution, in nats; None where it has no closed form."""
     return_: float
+    """Mean return of the episodes."""
     num_steps: float
     """Mean length of the episodes."""
 
@@ -46,11 +47,12 @@ class Length(NamedTuple):
 def best_goals(results: Results) -> Goals:
     """The goals that the best episode of each search reached, leaves ``[S, N, T, ..]``.
 
-    Results keep the steps that reached a goal. The last of them counts as the end of the episode, and as
-    its outcome the task goal: a step that only reaches that is not drawn, since every prompt ends with it.
+    Results only store the steps that reached a goal, so the last of these counts as the end of the
+    episode. The outcome is set to the task goal, which keeps the sampler from drawing that goal: every
+    prompt ends with it anyway.
 
     Raises:
-      DataError: if the results are of an older version, which did not keep reached goals.
+      DataError: if the results are from an older version, which did not store reached goals.
     """
     seeds, num, _ = results.returns.shape
     horizon = results.world.make().spec.horizon
@@ -73,17 +75,17 @@ def draw_prompts(
     lengths: Int[Array, "L"],
     num_draws: int,
 ) -> Prompt:
-    """Prompts with leaves ``[L, D, S, N, ..]``: for each length D of them from each trajectory.
+    """Draw D prompts of each length from each trajectory, leaves ``[L, D, S, N, ..]``.
 
-    Where a trajectory reached too few goals, a prompt is shorter than asked for.
+    If a trajectory reached too few goals, its prompts are shorter than asked for.
 
     Args:
       key: random key.
-      reached: what each trajectory reached, leaves ``[S, N, T, ..]``.
+      reached: the goals that each trajectory reached, leaves ``[S, N, T, ..]``.
       final_goals: the last goal of each prompt.
-      num_slots: P, the number of slots of the prompts.
-      lengths: the numbers of goals.
-      num_draws: D.
+      num_slots: P, the number of slots in a prompt.
+      lengths: the lengths of the prompts, in goals.
+      num_draws: D, the number of prompts per length and trajectory.
     """
     shape = (len(lengths), num_draws, *reached.length.shape)
     keys = jax.random.split(key, shape)
@@ -96,13 +98,13 @@ def draw_prompts(
 
 
 def by_length(results: Results, seed: int = 0, num_draws: int = DRAWS) -> list[Length]:
-    """How the policy acts under prompts of 1 to K goals, K being the longest that it was trained with.
+    """Run the policy under prompts of 1 to K goals, the longest prompt of its training.
 
-    Lengths that no trajectory has goals for are left out.
+    Lengths for which every trajectory reached too few goals are left out.
 
     Raises:
-      UsageError: if the policy of the results is no longer at its place.
-      DataError: if the results are of an older version or other weights, or a return is not finite.
+      UsageError: if the policy of the results has been moved.
+      DataError: if the results are from an older version or other weights, or a return is not finite.
     """
     world, env = envs.find(results.env), envs.make(results.env)
     policy = load_policy_of(results, world, None)
@@ -118,14 +120,14 @@ def by_length(results: Results, seed: int = 0, num_draws: int = DRAWS) -> list[L
     found = jax.tree.map(lambda rows: np.asarray(rows).reshape(shape), found)
     whole = np.asarray(prompts.mask).sum(axis=-1) == lengths[:, None, None, None]
     return [
-        _of_length(length, which, jax.tree.map(lambda rows, i=index: rows[i], found))
+        _average(length, which, jax.tree.map(lambda rows, i=index: rows[i], found))
         for index, (length, which) in enumerate(zip(lengths.tolist(), whole, strict=True))
         if which.any()
     ]
 
 
-def _of_length(num_goals: int, which: np.ndarray, found: Any) -> Length:
-    """The means over those of the prompts ``[D, S, N]`` that have the length."""
+def _average(num_goals: int, which: np.ndarray, found: Any) -> Length:
+    """Average over the prompts ``[D, S, N]`` that have the full length."""
     by_seed = [
         found.entropy[:, seed][which[:, seed]].mean()
         for seed in range(which.shape[1])
@@ -142,7 +144,7 @@ def _of_length(num_goals: int, which: np.ndarray, found: Any) -> Length:
 
 
 def as_table(world: str, head: str, lengths: list[Length]) -> str:
-    """The table in Markdown; ``head`` is the name of the policy's distribution of actions."""
+    """The table in Markdown; ``head`` is the name of the policy's action distribution."""
     rows = [
         [
             str(row.num_goals),
@@ -166,6 +168,6 @@ def as_table(world: str, head: str, lengths: list[Length]) -> str:
 
 
 def entropy_table(results: Results) -> str:
-    """How sure the policy of an adaptation is of its actions, by the length of its prompts, in Markdown."""
+    """The table for the policy of an adaptation, in Markdown."""
     head = load_policy_of(results, envs.find(results.env), None).config.head
     return as_table(results.env, head, by_length(results))

@@ -1,7 +1,7 @@
 """Release a trained policy: ``python -m experiments.release runs/pretrain/maze15/fast-seed0``.
 
-Puts weights, config, the world's test tasks and a model card into the package, where every other command
-finds them by default.
+This puts the weights, the config, the world's test tasks and a model card into the package, where all other
+commands find them by default.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ class ReleaseConfig(Common):
     source: tyro.conf.Positional[Path | None] = None
     """Folder of a finished pre-training run."""
     out: Path | None = None
-    """Folder to write (default: mgpo_jax/pretrained/ENV)."""
+    """Output folder (default: mgpo_jax/pretrained/ENV)."""
     env: Name | None = None
-    """The world of the run, as module:attribute where it has no registered name."""
+    """The world of the run, as module:attribute if it is not registered."""
 
 
 def main(config: ReleaseConfig) -> None:

@@ -25,12 +25,13 @@ class ReportConfig(Common):
     runs: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Result folders of adaptations to the same tasks."""
     out: Path = Path("report.html")
-    """HTML file to write; it needs no other file, no server and no network."""
+    """HTML file to write; it is self-contained and needs no server or network."""
     pictures: tuple[Path, ...] = ()
-    """PNG and GIF files to show below, such as the video of a kitchen that `experiments.plot` makes. Those
-    videos that lie in the result folders are shown anyway."""
+    """PNG and GIF files to show at the end, such as the videos that `experiments.plot` makes; videos in the
+    result folders are always shown."""
     env: Name | None = None
-    """A world of your own that the results name, as module:attribute: files alone import nothing."""
+    """Your own world, as module:attribute, if the results are from one; without it no user code is
+    imported."""
 
 
 def main(config: ReportConfig) -> None:
@@ -38,7 +39,7 @@ def main(config: ReportConfig) -> None:
     require_runs(config.runs, "report")
     check_page(config.out)
     if config.env is not None:
-        envs.find(config.env)  # from now on results may name its place
+        envs.find(config.env)  # imports the module, so that the results may name it
     from experiments.pages.report import write_report
 
     write_report(config.runs, config.out, config.pictures)
@@ -46,7 +47,7 @@ def main(config: ReportConfig) -> None:
 
 
 def check_page(out: Path) -> None:
-    """Raise ``UsageError`` for a place where no page can be written, or where something else lies."""
+    """Raise ``UsageError`` if the page cannot be written to a file, or would overwrite another file."""
     from experiments.store.seals import check_replaceable
 
     require_parent(out, "--out")

@@ -1,14 +1,14 @@
-"""What every command line shares: parsing, process settings, errors and exit codes.
+"""What all commands share: parsing, process settings, errors and exit codes.
 
-A command line is parsed before jax is imported, so that help and usage errors answer at once. Settings of
-the process that matter on a CPU, all in one place:
+A command line is parsed before jax is imported, so that help and usage errors appear at once. This module
+also holds the process settings that matter on a CPU:
 
-- One XLA device a core. The programs here are small; one on each core wastes less than one on all.
-- The C library never gives memory back to the kernel: a gradient step frees and allocates hundreds of
-  MB, and every page that comes back from the kernel costs a fault. All threads share one arena, since
-  the arenas of threads return their memory however they are set.
-- jax's persistent compilation cache (``~/.cache/mgpo_jax``, or ``$MGPO_CACHE``): the second run of a
-  command starts in seconds.
+- One XLA device per core. The programs here are small; one on each core wastes less than one on all cores.
+- The C library never returns memory to the kernel: a gradient step frees and allocates hundreds of MB, and
+  every page that comes back from the kernel costs a page fault. All threads share one arena, since
+  per-thread arenas return their memory whatever the settings.
+- jax's persistent compilation cache (``~/.cache/mgpo_jax``, or ``$MGPO_CACHE``) lets the second run of a
+  command start in seconds.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from mgpo_jax.claims import NO_ROOM, check_place
 from mgpo_jax.settings import flag
 
 OF_CALLBACK = "INTERNAL: Error when calling buffer callback"
-"""How jax begins its message of an error in a function that a program called on the host."""
+"""How jax's message begins when a host callback of a compiled program raises an error."""
 
 EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
 NEWS = 3.0
-"""Seconds after an error of one of several processes in which news may come that another is to blame."""
+"""Seconds to wait after an error in one of several processes, for news that another one caused it."""
 
 LEAST_COMPILED = 0.01
-"""Seconds of compiling from which a program is kept: a command has dozens of small ones."""
+"""Programs that take this many seconds to compile are cached; a command has dozens of small ones."""
 
 # mallopt parameters of the GNU C library
 M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -2, -3, -8
@@ -56,9 +56,9 @@ class Common:
     debug: bool = False
     """Show the traceback of an error."""
     quiet: bool = False
-    """Say nothing on stderr but an error: no progress, no notes."""
+    """Print nothing but errors on stderr: no progress, no notes."""
     config: Path | None = None
-    """A ``config.json`` of a run, whose settings stand where no flag is given."""
+    """The ``config.json`` of a run, whose settings become the defaults of the flags."""
 
 
 def configure() -> None:
@@ -77,10 +77,10 @@ def configure() -> None:
     os.environ["JAX_ENABLE_X64"] = "0"  # everything here is float32
     if "jax" in sys.modules:  # a world or method of a user was imported with it
         sys.modules["jax"].config.update("jax_enable_x64", False)
-    # jax reads these when it is imported, which is after a command has found nothing wrong.
+    # jax reads these on import, which happens after the command line has been checked.
     cache = cache_folder()
     try:
-        os.makedirs(cache, mode=0o700, exist_ok=True)  # programs are loaded from there
+        os.makedirs(cache, mode=0o700, exist_ok=True)  # private: programs are loaded from there
     except OSError as error:
         print(f"compiled programs are not kept: {cache}: {error.strerror}", file=sys.stderr)
         return
@@ -95,7 +95,7 @@ def configure() -> None:
 
 
 def cache_folder() -> str:
-    """Where compiled programs are kept: ``$MGPO_CACHE``, or ``~/.cache/mgpo_jax``."""
+    """The folder of compiled programs: ``$MGPO_CACHE``, or ``~/.cache/mgpo_jax`` if that is not set."""
     if "MGPO_CACHE" in os.environ:
         return os.environ["MGPO_CACHE"]
     try:
@@ -106,7 +106,7 @@ def cache_folder() -> str:
 
 
 def expect_compiling() -> None:
-    """Say on stderr that the work begins with compiling, where no compiled programs are kept yet."""
+    """If the compilation cache is empty, say on stderr that the work begins with compiling."""
     try:
         empty = next(os.scandir(cache_folder()), None) is None
     except OSError:
@@ -130,8 +130,8 @@ def run(
 
     Args:
       config_class: a frozen dataclass derived from ``Common``.
-      main: the command; it imports what needs jax by itself.
-      default: what chooses the defaults, where they depend on other flags; see ``parsing.parse``.
+      main: the command; its docstring is the text of ``--help``, and it imports whatever needs jax itself.
+      default: chooses the defaults, where they depend on other flags; see ``parsing.parse``.
       argv: the words of the command line (default: those of the process).
     """
     words = list(sys.argv[1:] if argv is None else argv)
@@ -147,9 +147,9 @@ def run(
             with _silence() if config.quiet else nullcontext():
                 configure()
                 main(config)
-                _part()
+                _wait_for_others()
     except signals.Stopped as stop:
-        _part()
+        _wait_for_others()
         _fail(str(stop), 128 + stop.number, debug, "")
     except KeyboardInterrupt:
         sys.exit(EXIT_INTERRUPTED)
@@ -164,10 +164,10 @@ def run(
 
 
 def _make_sturdy(debug: bool) -> None:
-    """Keep a command going whatever it prints, and leave the report of errors to the main thread.
+    """Keep the command running whatever it prints, and let only the main thread report errors.
 
-    Characters that a stream cannot print are escaped. An error in another thread or in a destructor is not
-    printed, since the main thread meets it as well.
+    Characters that a stream cannot print are escaped. Errors in other threads or in destructors are not
+    printed, since the main thread meets them as well.
     """
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
@@ -181,7 +181,7 @@ def _make_sturdy(debug: bool) -> None:
 
 
 class _Tolerant:
-    """A stream for messages. Where nobody reads them any more, a command goes on without them."""
+    """A stream for messages that ignores failed writes, for example when its reader is gone."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
@@ -200,7 +200,7 @@ class _Tolerant:
 
 
 class Silent(_Tolerant):
-    """A stream that shows nothing."""
+    """A stream that discards everything written to it."""
 
     def write(self, text: str) -> int:
         return len(text)
@@ -208,7 +208,7 @@ class Silent(_Tolerant):
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """Show nothing of what is written to stderr; an error that leaves the block is shown after it."""
+    """Discard what is written to stderr within the block; errors that leave it are reported afterward."""
     stream, sys.stderr = sys.stderr, Silent(sys.stderr)
     try:
         yield
@@ -217,7 +217,7 @@ def _silence() -> Iterator[None]:
 
 
 def say(text: str) -> None:
-    """Print a result. Where stdout is closed or full, the command goes on without it."""
+    """Print a result on stdout. If stdout is closed or full, the command goes on without it."""
     if sys.stdout is None:
         return
     try:
@@ -227,14 +227,14 @@ def say(text: str) -> None:
     try:
         print(text, flush=True)
     except OSError as error:
-        # Whatever is left in the stream's buffer must not fail again when the interpreter ends.
+        # What is left in the stream's buffer must not fail again when the interpreter exits.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if not isinstance(error, BrokenPipeError):
             print(f"stdout cannot be written ({error.strerror})", file=sys.stderr)
 
 
 def explained(error: BaseException, config: Any = None) -> str:
-    """An error that was not foreseen, as one line that says what to do where that is known."""
+    """An unexpected error as a one-line message that says how to mend it, where that is known."""
     for cause in _causes(error):
         if isinstance(cause, OSError) and cause.errno in NO_ROOM:
             folder = (
@@ -255,7 +255,7 @@ def explained(error: BaseException, config: Any = None) -> str:
             return "there is not enough memory; ask for less at once"
     text = str(error).splitlines()[0] if str(error) else "no reason is known"
     if text.startswith(OF_CALLBACK):
-        # Then comes a traceback, which ends with the error on the host.
+        # A traceback follows, and its last line is the error on the host.
         return str(error).strip().splitlines()[-1].removeprefix("envs.errors.")
     platforms = os.environ.get("JAX_PLATFORMS")
     if platforms and "nable to initialize backend" in text:
@@ -264,7 +264,7 @@ def explained(error: BaseException, config: Any = None) -> str:
 
 
 def _flag_of(config: Any, path: Any) -> str:
-    """The flag that named a path, to begin a message; empty if none did."""
+    """The flag whose value a path begins with, as the start of a message; empty if there is none."""
     for name, value in (vars(config) if config is not None else {}).items():
         if isinstance(value, Path) and str(path).startswith(str(value)):
             return f"{flag(name)}: "
@@ -272,7 +272,7 @@ def _flag_of(config: Any, path: Any) -> str:
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:
-    """An error, and those that it was raised from or beside."""
+    """An error, followed by its causes and contexts."""
     seen: set[int] = set()
     while error is not None and id(error) not in seen:
         seen.add(id(error))
@@ -281,15 +281,15 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
 
 
 def program_name() -> str:
-    """How the process was called, for usage messages."""
+    """The command as the user called it, for usage messages."""
     stem = Path(sys.argv[0]).stem
     if stem in ("mgpo", "__main__"):
         return " ".join(["mgpo", *sys.argv[1:2]])
     return f"python -m experiments.{stem}"
 
 
-def _part() -> None:
-    """Wait until all processes of this command have come to its end."""
+def _wait_for_others() -> None:
+    """Wait until all processes have reached the end of the command."""
     if (team := processes.team()) is not None:
         team.leave(wait=True)
 
@@ -316,14 +316,14 @@ def require_runs(runs: Sequence[Path], command: str) -> None:
 
 
 def refuse_existing(folder: Path, *ways_out: str) -> None:
-    """Raise ``UsageError`` with the ways out if an output exists, or if it could not be made."""
+    """Raise ``UsageError`` if an output exists, with ways out in the message, or if it cannot be made."""
     if os.path.lexists(folder):
         raise UsageError(f"{folder} exists already; {', or '.join(ways_out)}")
     check_place(folder)
 
 
 def refuse_existing_file(path: Path, named_by: str) -> None:
-    """Raise ``UsageError`` if a file to be written exists, or if it could not be made."""
+    """Raise ``UsageError`` if an output file exists, or if it cannot be made."""
     if os.path.lexists(path):
         raise UsageError(f"{named_by} {path} exists already; remove it or choose another file")
     require_parent(path, named_by)
@@ -331,6 +331,6 @@ def refuse_existing_file(path: Path, named_by: str) -> None:
 
 
 def require_parent(path: Path, named_by: str) -> None:
-    """Raise ``UsageError`` if the folder in which a file is to be written does not exist."""
+    """Raise ``UsageError`` if the parent folder of an output file does not exist."""
     if not path.name or not path.absolute().parent.is_dir():
         raise UsageError(f"{named_by} {path}: there is no folder {path.parent}; make it first")

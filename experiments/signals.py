@@ -1,12 +1,12 @@
 """Requests to stop: Ctrl-C (SIGINT), SIGTERM, and SIGUSR1, which schedulers send before they kill.
 
-The operating system tells a thread of its own about a signal, at once even while the main thread is deep
-inside a compiled program. What happens then depends on what the command is doing: it is left at once, after
-cleaning up, or (``asked_to_stop``) it is asked to stop at its next chance. The second request always ends
-it at once. All exit with 128 plus the signal's number.
+A listener thread hears of a signal at once, even while the main thread is deep inside a compiled program.
+What happens then depends on what the command is doing: by default the process cleans up and exits at once;
+within ``asked_to_stop`` the command stops at its next chance. A second request always ends the process at
+once. The exit code is 128 plus the signal's number.
 
-Where several processes run one command (``experiments.joining``), a request to one of them is one to all.
-A scheduler, or a terminal, may send each of them its own: those count as one request.
+If several processes run one command (``experiments.joining``), a request to one of them is passed on to
+all. A scheduler or a terminal may signal each of them; those signals count as one request.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ SIGNALS = tuple(
 )
 
 MOMENT = 1.0
-"""Seconds that the main thread waits to be ended."""
+"""Seconds that the main thread waits for the listener to end the process."""
 
 
 class Stopped(KeyboardInterrupt):
-    """A command stopped because it was asked to; ``number`` is that of the signal."""
+    """Raised when a command stops because a signal asked it to; ``number`` is the signal's."""
 
     def __init__(self, message: str, number: int) -> None:
         super().__init__(message)
@@ -38,15 +38,15 @@ class Stopped(KeyboardInterrupt):
 
 
 class _Watch:
-    """What signals do at present."""
+    """The signals received so far, and how to react to the next one."""
 
     def __init__(self) -> None:
         self.forget()
 
     def forget(self) -> None:
-        """Be as if no signal had come and no command were running."""
+        """Reset to the state before any signal and any command."""
         self.asked: list[int] = []
-        self.times: Counter[int] = Counter()  # requests by the number of the process that got them
+        self.times: Counter[int] = Counter()  # number of requests by the process that got them
         self.farewell: Callable[[], str] = lambda: ""
         self.tell: Callable[[int], None] = lambda number: None
         self.outlast: Callable[[], None] = lambda: None
@@ -56,7 +56,9 @@ class _Watch:
     def receive(self, number: int, process: int = 0) -> None:
         """React to a signal; returns at once, so that the next one can be received.
 
-        ``process`` is 0 for this one, else the place of another that got the signal.
+        Args:
+          number: the signal's number.
+          process: 0 if this process got the signal, another number for each other process.
         """
         self.asked.append(number)
         self.times[process] += 1
@@ -71,7 +73,7 @@ class _Watch:
             threading.Thread(target=self._leave, args=(number,), daemon=True).start()
 
     def _leave(self, number: int) -> None:
-        """Say how to go on, clean up, and end the process, whatever it is doing."""
+        """Print the farewell, clean up, and end the process, whatever it is doing."""
         from mgpo_jax.claims import clean_up
 
         try:
@@ -87,20 +89,20 @@ _watch = _Watch()
 
 
 def _say(text: str) -> None:
-    with suppress(OSError, ValueError):  # nobody may be reading any more
+    with suppress(OSError, ValueError):  # the reader may be gone
         print(f"\n{text}" if sys.stderr.isatty() else text, file=sys.stderr, flush=True)
 
 
 @contextmanager
 def watched() -> Iterator[None]:
-    """Receive signals in the block. In a thread, where signals cannot be received, nothing changes."""
+    """Handle signals within the block. Outside the main thread, which alone can do so, nothing changes."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     _watch.forget()
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
-    # What the parent has told us to ignore, as a script does for its background jobs, stays ignored.
+    # Signals that the parent told us to ignore, as a script does for background jobs, stay ignored.
     heard = [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
     before = {number: signal.signal(number, _hold) for number in heard}
     pipe_before = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
@@ -120,10 +122,10 @@ def watched() -> Iterator[None]:
 
 
 def _hold(number: int, frame: FrameType | None) -> None:
-    """Keep the main thread from starting anything while the listener ends the process.
+    """Pause the main thread while the listener ends the process.
 
-    Otherwise it could make a file after the listener has looked whether there are any. The wait has an end
-    because the main thread may hold a lock that the listener needs.
+    Otherwise it could create a file after the listener has cleaned up. The pause is bounded because the
+    main thread may hold a lock that the listener needs.
     """
     if not _watch.patient:
         time.sleep(MOMENT)
@@ -137,15 +139,17 @@ def _listen(reading: int) -> None:
 
 
 def tell_others(tell: Callable[[int], None], outlast: Callable[[], None]) -> None:
-    """Call ``tell`` with the number of every signal that comes, and ``outlast`` before it ends the process.
+    """Set the hooks by which this process tells others of signals.
 
-    ``outlast`` waits for other processes that end before this one may.
+    Args:
+      tell: called with the number of every signal that this process gets.
+      outlast: called before a signal ends the process; waits for processes that must end before it.
     """
     _watch.tell, _watch.outlast = tell, outlast
 
 
 def receive(number: int, process: int) -> None:
-    """React to a signal that another process got; ``process`` tells apart who."""
+    """React to a signal that another process got; ``process`` is that process's number."""
     _watch.receive(number, 1 + process)
 
 
@@ -158,7 +162,7 @@ def is_leaving() -> bool:
 def asked_to_stop() -> Iterator[Callable[[], int]]:
     """Let the block choose when to stop.
 
-    It gets a function that returns the number of the signal that asks it to stop, or 0 if none came.
+    Yields a function that returns the number of the first signal received, or 0 if there was none.
     """
     _watch.patient = True
     try:
@@ -169,7 +173,7 @@ def asked_to_stop() -> Iterator[Callable[[], int]]:
 
 @contextmanager
 def farewell(text: Callable[[], str]) -> Iterator[None]:
-    """Print ``text()`` on stderr, unless it is empty, if a signal ends the process within the block."""
+    """If a signal ends the process within the block, print ``text()`` on stderr unless it is empty."""
     before, _watch.farewell = _watch.farewell, text
     try:
         yield

@@ -1,4 +1,4 @@
-"""``adapt --sweep c=0.1,1,10``: hyper-parameters with several values each, all in one compiled program."""
+"""``adapt --sweep c=0.1,1,10``: sweep over values of hyper-parameters, all in one compiled program."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from mgpo_jax.settings import check_settings, check_values, get_parts, types_of
 
 
 def variants(config: AdaptConfig) -> dict[str, AdaptConfig]:
-    """The settings of each variant by its name, such as ``c=0.1``; several swept settings are crossed.
+    """The settings of each variant by name, such as ``c=0.1``; several hyper-parameters form a grid.
 
     Raises:
-      UsageError: for what is no sweep of numbers that one program can take.
+      UsageError: for a sweep that is malformed, or over a setting that one program cannot vary.
     """
     swept = dict(_values(text, config) for text in config.sweep)
     if len(swept) < len(config.sweep):
@@ -66,7 +66,7 @@ def _values(text: str, config: AdaptConfig) -> tuple[str, list[int | float]]:
     kind = int if int in get_parts(types_of(settings_class)[name]) else float
     values: list[int | float] = []
     for word in listed.split(","):
-        value: Any = word  # what is no number is refused by the check
+        value: Any = word  # the check refuses words that are not numbers
         with suppress(ValueError):
             value = kind(word)
         try:
@@ -78,7 +78,7 @@ def _values(text: str, config: AdaptConfig) -> tuple[str, list[int | float]]:
 
 
 def show(config: AdaptConfig, folders: Sequence[Path]) -> None:
-    """Print the table of the variants, and draw their learning curves together."""
+    """Print a table of the variants, and draw their learning curves in one figure."""
     from experiments.drawing import write
     from experiments.figures import later, learning_curve
     from experiments.store.results import load_results
@@ -100,7 +100,7 @@ def sweep_and_save(
       The folders, in the order of the variants.
 
     Raises:
-      UsageError: for a sweep that is none, or unfinished work that ``--resume`` does not ask for.
+      UsageError: for an invalid sweep, or unfinished work without ``--resume``.
       DataError: if the folder exists, another process makes it, or a return is not finite.
     """
     named = variants(config)

@@ -1,1 +1,1 @@
-"""What lies on disk: settings, results, policies, tables."""
+"""Everything kept on disk: settings, results, policies, tables."""

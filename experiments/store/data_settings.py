@@ -1,4 +1,4 @@
-"""Settings of ``experiments.data``: what is imported from where, and what its goals are. No jax."""
+"""Settings of ``experiments.data``, for importing, exporting and checking datasets. Nothing imports jax."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ Number = Annotated[float, Ge(-1e18), Le(1e18)]
 
 @dataclass(frozen=True)
 class DataCommandConfig(Common):
-    """Settings of ``experiments.data`` without a command."""
+    """Settings of ``experiments.data`` itself, without a subcommand."""
 
     what: tyro.conf.Positional[str] = ""
-    """import (logs become a dataset), export (a dataset becomes logs), check (what is wrong with a dataset)
-    or info (what is in it); each has --help of its own."""
+    """The subcommand: import (make a dataset of logs), export (write a dataset in another format), check
+    (find faults in a dataset) or info (describe a dataset); each has its own --help."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,36 +31,36 @@ class ImportConfig(Common):
     """Settings of ``experiments.data import``."""
 
     source: tyro.conf.Positional[str] = ""
-    """A Minari dataset (its folder or its id), an HDF5 file with flat arrays as D4RL has them, an npz file
-    with the same arrays, or a folder with an npz or parquet file for each episode."""
+    """The logs: a Minari dataset (folder or id), an HDF5 file with flat arrays in D4RL's format, an npz
+    file with the same arrays, or a folder with one npz or parquet file per episode."""
     out: Path | None = None
-    """Folder to write; it must not exist."""
+    """Output folder; must not exist yet."""
     goal: Name | None = None
-    """The function, as module:function, that tells achieved goals [T+1, G] of observations [T+1, ...], or
-    of a whole episode if its parameter is called ``episode``."""
+    """A function, as module:function, that maps observations [T+1, ...] to achieved goals [T+1, G]; it gets
+    the whole episode if its parameter is called ``episode``."""
     goal_columns: tuple[Index, ...] = ()
-    """Numbers of the components of an observation that are the achieved goal, counted from 0."""
+    """Indices of the observation components that form the achieved goal, counted from 0."""
     goal_array: Name | None = None
-    """Name of the array with an achieved goal for every observation, such as achieved_goal."""
+    """Name of the array that holds an achieved goal for every observation, such as achieved_goal."""
     obs_arrays: tuple[Name, ...] = ()
-    """Names of the arrays that are the observation, one after the other (default: observations)."""
+    """Names of the arrays that are concatenated to the observation (default: observations)."""
     reached: Literal["always", "changes"] = "always"
-    """When a goal counts as reached: at every step, as positions do, or where it differs from the one
-    before, as subtasks do."""
+    """When a goal counts as reached: at every step (suits positions), or when it differs from the previous
+    one (suits subtasks)."""
     action_low: tuple[Number, ...] = ()
-    """Smallest actions, one number for all components or one for each; they become -1."""
+    """Lower bounds of the actions, one for all components or one for each; they are scaled to -1."""
     action_high: tuple[Number, ...] = ()
-    """Largest actions, likewise; they become 1."""
+    """Upper bounds of the actions, likewise; they are scaled to 1."""
     num_actions: Count | None = None
-    """Number of discrete actions (default: what the source says, or the largest in it plus 1)."""
+    """Number of discrete actions (default: from the source, or the largest action in it plus 1)."""
     horizon: Count | None = None
-    """Steps after which an episode is cut off (default: what the source says, or the longest in it)."""
+    """Steps after which an episode is truncated (default: from the source, or its longest episode)."""
     cut: bool = True
-    """Whether a trajectory that is cut at any step shows how to reach another goal."""
+    """Whether any prefix of a trajectory demonstrates how to reach the goal achieved at its end."""
     skip_bad: bool = False
-    """Leave episodes out that hold NaN or infinity, or are longer than the horizon."""
+    """Skip episodes that contain NaN or infinity, or that are longer than the horizon."""
     name: Name | None = None
-    """What messages call the world that the logs are from (default: the name of the source)."""
+    """Name of the world that the logs are from, for messages (default: the name of the source)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,9 +70,9 @@ class ExportConfig(Common):
     folder: tyro.conf.Positional[Path | None] = None
     """Folder of a dataset."""
     out: Path | None = None
-    """An npz file, or a folder for a Minari dataset, to write; it must not exist."""
+    """Output npz file, or output folder of a Minari dataset; must not exist yet."""
     author: str = ""
-    """Who made it, for the metadata of a Minari dataset."""
+    """Author in the metadata of a Minari dataset."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,11 +82,11 @@ class CheckDataConfig(Common):
     folder: tyro.conf.Positional[Path | None] = None
     """Folder of a dataset."""
     env: Name | None = None
-    """The world that it must fit (default: any)."""
+    """The world that the dataset must fit (default: any)."""
     horizon: Count | None = None
-    """Steps after which an episode is cut off (default: that of the world, or of the manifest)."""
+    """Steps after which an episode is truncated (default: the world's, or the manifest's)."""
     most: Count = 5
-    """Findings of one kind that are printed; the others are counted."""
+    """Maximum number of findings of each kind to print; the rest are only counted."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +106,7 @@ SUBCOMMANDS: dict[str, Any] = {
 
 
 def check_import(config: ImportConfig) -> None:
-    """Raise ``UsageError`` for settings of an import that do not go together."""
+    """Raise ``UsageError`` for import settings that are missing or contradict each other."""
     if not config.source:
         raise UsageError(
             "nothing to import; usage: python -m experiments.data import SOURCE --out FOLDER"
@@ -145,17 +145,21 @@ def check_import(config: ImportConfig) -> None:
 
 
 def _shown(value: Any) -> str:
-    """A name, or numbers, as they were given."""
+    """A name or numbers as they stood on the command line."""
     if isinstance(value, tuple):
         return " ".join(map(repr, value))
     return shown(value)
 
 
 def require_folder(folder: Path | None, what: str) -> Path:
-    """The folder of a dataset that a command was given.
+    """The folder of a dataset, checked.
+
+    Args:
+      folder: the folder that the user gave, if any.
+      what: the subcommand, for the usage line.
 
     Raises:
-      UsageError: if it was given none, or there is none.
+      UsageError: if no folder was given, or it does not exist.
     """
     if folder is None:
         raise UsageError(f"no dataset given; usage: python -m experiments.data {what} FOLDER")

@@ -1,4 +1,4 @@
-"""The names of the files in the folder of an adaptation. Nothing here imports jax."""
+"""The file names in the result folder of an adaptation. Nothing here imports jax."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Settings of commands that build on each other, and the presets they start from. Nothing imports jax.
+"""Settings of the main commands, and the presets that they start from. Nothing here imports jax.
 
-``fast`` is the recipe for two cores, in ten minutes to two hours; ``paper`` has the paper's values
-(Table 6, and its code's where the text is silent); ``smoke`` only shows that everything runs. What differs
-between worlds stands in their ``World`` records.
+``fast`` is our recipe, which trains on two cores in ten minutes to two hours; ``paper`` has the paper's
+values (Table 6, or its code's where the text is silent); ``smoke`` only shows that everything runs.
+Settings that differ between worlds are in their ``World`` records.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ from mgpo_jax.settings import (
 RUNS = Path("runs")
 DEFAULT_WORLD = "maze15"
 NO_WORLD = "none"
-"""What ``--env`` of a training is called on data that no world is registered for."""
+"""The value of ``--env`` when training on a dataset without a registered world."""
 
 
 def data_root() -> Path:
-    """Where datasets are kept: ``$MGPO_DATA``, or the folder ``data``."""
+    """The folder of all datasets: ``$MGPO_DATA``, or ``data`` if that is not set."""
     return Path(os.environ.get("MGPO_DATA", "data"))
 
 
@@ -70,37 +70,37 @@ class CollectConfig(Joined):
     env: Name = DEFAULT_WORLD
     """The world, by name or as module:attribute (``python -m experiments.list`` shows the names)."""
     demonstrator: Annotated[Name | None, tyro.conf.arg(aliases=("--policy",))] = None
-    """Who demonstrates, in some worlds with settings changed, as in ``expert,drop=0.3`` (default: the
-    world's first demonstrator)."""
+    """The demonstrator; some take settings, as in ``expert,drop=0.3`` (default: the world's first
+    demonstrator)."""
     trajectories: Annotated[NumTrajectories, tyro.conf.arg(aliases=("--episodes",))] = 10_000
-    """Trajectories to keep."""
+    """Number of trajectories to collect."""
     seed: Seed = 0
-    """Seed of tasks and demonstrator."""
+    """Random seed of the tasks and the demonstrator."""
     out: Path | None = None
-    """Folder to write (default: data/ENV/DEMONSTRATOR-TRAJECTORIES-seedSEED, under $MGPO_DATA if set)."""
+    """Output folder (default: data/ENV/DEMONSTRATOR-TRAJECTORIES-seedSEED, under $MGPO_DATA if set)."""
     resume: bool = False
-    """Go on with a collection that was stopped; the dataset is the same as without a stop."""
+    """Continue an interrupted collection; the dataset is the same as that of an uninterrupted one."""
 
 
 def dataset_folder(config: CollectConfig, demonstrator: str) -> Path:
-    """Where a dataset lies."""
+    """The folder of the dataset that a config describes."""
     name = f"{demonstrator}-{config.trajectories}-seed{config.seed}"
     return config.out or data_root() / envs.find(config.env).home / name
 
 
 @dataclass(frozen=True)
 class DataConfig:
-    """Which dataset to train on."""
+    """The dataset to train on."""
 
     demonstrator: Annotated[Name | None, tyro.conf.arg(aliases=("--policy",))] = None
-    """Who collects it, in some worlds with settings changed, as in ``expert,drop=0.3`` (default: the
-    world's first demonstrator)."""
+    """The demonstrator of the dataset; some take settings, as in ``expert,drop=0.3`` (default: the world's
+    first demonstrator)."""
     trajectories: Annotated[NumTrajectories, tyro.conf.arg(aliases=("--episodes",))] = 10_000
-    """Trajectories to train on; they are collected first where they are not there yet."""
+    """Number of trajectories to train on; a dataset that does not exist yet is collected first."""
     data_seed: Seed = 0
-    """Seed of the dataset."""
+    """Random seed of the dataset."""
     data_folder: Annotated[Path | None, tyro.conf.arg(aliases=("--data",))] = None
-    """Folder of a dataset of your own (``python -m experiments.data import``) to train on; it needs no
+    """Folder of your own dataset (made by ``python -m experiments.data import``) to train on; needs no
     world."""
 
 
@@ -110,56 +110,58 @@ class PretrainConfig(Joined):
 
     env: Name = NO_WORLD
     """The world, by name or as module:attribute (``python -m experiments.list`` shows the names). With
-    ``--data`` the default is none: nothing is evaluated on the way then."""
+    ``--data`` it defaults to none, and the policy is not evaluated during training."""
     method: Name = MULTI_GOAL
-    """The kind of network: mgpo follows prompts, ptgm and spirl are the low levels of those methods."""
+    """What to train: mgpo, a policy that follows prompts; ptgm or spirl, the low-level policy of that
+    method."""
     preset: Name = "fast"
-    """Where the defaults below come from: fast, paper or smoke."""
+    """Preset that the defaults below come from: fast, paper or smoke."""
     data: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
     train: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
     init: Path | None = None
-    """Folder of a policy whose network and weights training starts from (default: random weights)."""
+    """Folder of a policy to initialize the network and its weights from (default: random weights)."""
     max_prompt_length: NumGoals = 5
-    """K, the longest prompt [5]."""
+    """Maximum number of goals in a prompt, K [5]."""
     dropout: Share = RECIPE_NETWORK["dropout"]
     """Dropout rate [0.1]."""
     prompt_order: bool = True
-    """Give prompt goals a position embedding [False]."""
+    """Add position embeddings to the goals of a prompt [False]."""
     embed_dim: Width = 128
-    """Width of the network [128]."""
+    """Embedding dimension of the transformer [128]."""
     num_layers: NumLayers = 3
-    """Transformer blocks [3]."""
+    """Number of transformer blocks [3]."""
     num_heads: Width = RECIPE_NETWORK["num_heads"]
-    """Attention heads, which share the width of the network evenly [1]."""
+    """Number of attention heads; must divide the embedding dimension [1]."""
     tokens_per_step: TokensPerStep = 2
-    """Tokens of a step: an observation and an action as 2, or the last action and the observation summed
-    as 1 [2]."""
+    """Tokens per time step: 2 for an observation token and an action token, 1 for the sum of the previous
+    action and the observation [2]."""
     encoder: EncoderName = "linear"
-    """How observations become tokens [linear]; ``cells`` embeds the codes and counts of worlds that have
-    them, other encoders come from one world and are for it."""
+    """Observation encoder [linear]; ``cells`` embeds the codes and counts of worlds that have them, and the
+    others each serve the one world that defines them."""
     head: Head | None = None
-    """Distribution of actions; continuous ones have all but categorical (default: that of the preset, else
-    the first that fits) [fixed_gaussian in the authors' code]."""
+    """Action distribution; discrete actions need categorical, continuous ones any other (default: the
+    preset's, or else the first that fits) [fixed_gaussian in the authors' code]."""
     standardize_obs: bool = False
-    """Standardize observations by their mean and spread in the dataset [False]."""
+    """Standardize observations by their mean and standard deviation in the dataset [False]."""
     holdout: NumTrajectories = 200
-    """Trajectories kept out of training for the validation loss."""
+    """Trajectories held out for the validation loss."""
     eval_tasks: NumTasks = 64
-    """Tasks of the evaluation on the way, an episode each (no test tasks)."""
+    """Tasks of an evaluation during training, one episode each; never test tasks."""
     eval_every: Count = 1_000
-    """Steps between evaluations."""
+    """Gradient steps between evaluations."""
     save_every: Count = 500
-    """Steps between checkpoints."""
+    """Gradient steps between checkpoints."""
     out: Path | None = None
-    """Run folder (default: runs/pretrain/ENV/PRESET-seedSEED, with the method before the preset)."""
+    """Run folder (default: runs/pretrain/ENV/PRESET-seedSEED; methods other than mgpo come before the
+    preset)."""
     resume: bool = False
-    """Continue an interrupted run from its newest checkpoint, bit for bit."""
+    """Continue an interrupted run from its latest checkpoint, bit for bit."""
     dry_run: bool = False
-    """Only say what would be done, and some CPU time that it takes."""
+    """Print what would be done and examples of the CPU time it takes, then exit."""
     tb: bool = False
-    """Also write metrics for TensorBoard (extra: tb)."""
+    """Also log metrics to TensorBoard (extra: tb)."""
     wandb: bool = False
-    """Also send metrics to Weights & Biases (extra: wandb)."""
+    """Also log metrics to Weights & Biases (extra: wandb)."""
 
     @property
     def folder(self) -> Path:
@@ -171,7 +173,7 @@ class PretrainConfig(Joined):
 
 
 def file_name(name: str) -> str:
-    """A world's or method's name, or its place, as the name of a folder."""
+    """The folder name for a world or method, given by name or as module:attribute."""
     return name.replace(":", ".")
 
 
@@ -202,10 +204,14 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 
 
 def with_settings(config: PretrainConfig, changes: Mapping[str, Any]) -> PretrainConfig:
-    """The config with some settings changed, by the names of their flags.
+    """The config with some settings replaced, wherever they are nested.
+
+    Args:
+      config: the config.
+      changes: new values by the names of the settings.
 
     Raises:
-      UsageError: for a name that is no setting, with the nearest one.
+      UsageError: for an unknown setting, with the nearest known name.
     """
     groups: dict[str, dict[str, Any]] = {"": {}, "data": {}, "train": {}}
     known: dict[str, Any] = {"": config, "data": config.data, "train": config.train}
@@ -223,28 +229,28 @@ def with_settings(config: PretrainConfig, changes: Mapping[str, Any]) -> Pretrai
 
 
 def pretrain_preset(env: str, preset: str, method: str = MULTI_GOAL) -> PretrainConfig:
-    """The default settings: the general ones, those of the world's record and of the kind of network."""
+    """The default settings of a preset, in which the world's record and the kind of network have a say."""
     world, kind = envs.find(env), KINDS.find(method)
     if preset not in PRESETS:
         raise nearest(preset, PRESETS, "preset")
     config = PretrainConfig(env=env, preset=preset, method=method)
     own = world.presets.get(preset, {})
     smoke = preset == "smoke"
-    if smoke or not own:  # it starts from the world's fast one
+    if smoke or not own:  # start from the world's fast preset
         config = with_settings(config, world.presets.get("fast", {}))
     config = with_settings(config, kind.preset)
     config = with_settings(config, PRESETS[preset])
-    if smoke:  # few padded lengths, so that little is compiled
+    if smoke:  # fewer padded lengths mean fewer compilations
         config = with_settings(config, {"bucket": 8 * config.train.bucket})
     return with_settings(config, own)
 
 
 def pretrain_default(config: PretrainConfig, flags: Iterable[str] = ()) -> PretrainConfig:
-    """The defaults that the world and the preset of a config choose, and the policy that it starts from.
+    """The defaults that a config's world, its preset and the policy that it starts from imply.
 
     Raises:
       UsageError: if there is no such world, preset or policy.
-      DataError: if the config of the policy is damaged, or that of a run that is resumed.
+      DataError: if the config of that policy, or of the run to resume, is damaged.
     """
     default = _preset_of(config)
     if config.init is None:
@@ -256,8 +262,8 @@ def pretrain_default(config: PretrainConfig, flags: Iterable[str] = ()) -> Pretr
 
 
 def _preset_of(config: PretrainConfig) -> PretrainConfig:
-    """The defaults of a world, or those for data of one's own."""
-    from experiments.store import recipes  # which needs the settings
+    """The defaults for a world, or for a user's own dataset."""
+    from experiments.store import recipes  # imports this module
 
     folder = config.data.data_folder
     if folder is None:
@@ -277,23 +283,23 @@ def _preset_of(config: PretrainConfig) -> PretrainConfig:
 
 
 INIT = "init"
-"""The folder in that of a run where the policy lies that it started from."""
+"""Subfolder of a run with its copy of the policy that training started from."""
 OF_INITIAL = (*OF_WEIGHTS, "standardize_obs")
-"""The settings of a training that belong to the policy that it starts from."""
+"""Settings of a training that are fixed by the policy it starts from."""
 MEND_INIT = "give the folder of another policy with --init, such as RUN/policy"
 
 
 class Initial(NamedTuple):
-    """What is known of a policy to start from before its weights are read."""
+    """What the config of an initial policy says, read without its weights."""
 
     network: dict[str, Any]
-    """Those settings of a training that belong to it (``OF_INITIAL``), by name."""
+    """The settings that the policy fixes (``OF_INITIAL``), by name."""
     sha256: str
-    """Of its weights."""
+    """Hash of its weights."""
 
 
 class _PolicyConfig(BaseModel):
-    """What is read of the ``config.json`` of a policy; there are other entries."""
+    """The entries of a policy's ``config.json`` that are read here; others are ignored."""
 
     model_config = {**STRICT, "extra": "ignore"}
 
@@ -302,14 +308,14 @@ class _PolicyConfig(BaseModel):
 
 
 def goes_on(config: PretrainConfig) -> bool:
-    """Whether a config resumes a run that has begun."""
+    """Whether a config resumes a run that already exists."""
     return config.resume and os.path.isfile(config.folder / CONFIG)
 
 
 def initial_folder(config: PretrainConfig) -> Path:
-    """Where the policy lies that a training starts from; a run that is resumed has a copy of its own.
+    """The folder of the policy that a training starts from; a resumed run uses its own copy.
 
-    Only for a config with ``init``.
+    The config must have ``init`` set.
     """
     assert config.init is not None
     kept = config.folder / INIT
@@ -317,22 +323,22 @@ def initial_folder(config: PretrainConfig) -> Path:
 
 
 def mend_initial(config: PretrainConfig) -> str:
-    """What mends a damaged policy to start from, the end of a message."""
+    """How to mend a damaged initial policy, as the end of an error message."""
     folder = initial_folder(config)
     return MEND_INIT if folder == config.init else f"remove {folder}, and --init is read again"
 
 
 def read_initial(config: PretrainConfig) -> Initial:
-    """The config of the policy that a training starts from, as ``initial_at``."""
+    """The config of the policy that a training starts from; raises as ``initial_at`` does."""
     return initial_at(initial_folder(config), mend_initial(config))
 
 
 def initial_at(folder: Path, mend: str = MEND_INIT) -> Initial:
-    """The config of a policy to start from.
+    """The config of an initial policy.
 
     Args:
-      folder: where it lies.
-      mend: what mends a damaged one, the end of the message.
+      folder: folder of the policy.
+      mend: how to mend a damaged one, the end of the error message.
 
     Raises:
       UsageError: if there is no policy in the folder.
@@ -342,7 +348,7 @@ def initial_at(folder: Path, mend: str = MEND_INIT) -> Initial:
     if not os.path.isfile(path):
         raise UsageError(f"no policy in {folder} ({CONFIG} is missing); {mend}")
     document: _PolicyConfig = read_document(path, _PolicyConfig, mend)
-    general = PretrainConfig()  # older policies lack settings that had one value then
+    general = PretrainConfig()  # older policies lack settings that were constants at the time
     network = {name: document.network.get(name, getattr(general, name)) for name in OF_WEIGHTS}
     types = types_of(PretrainConfig)
     for name, value in network.items():
@@ -353,7 +359,7 @@ def initial_at(folder: Path, mend: str = MEND_INIT) -> Initial:
 
 
 def check_pretraining(config: PretrainConfig) -> None:
-    """Raise ``UsageError`` for settings of a training that are right by themselves, but not together."""
+    """Raise ``UsageError`` for training settings that are valid on their own but not in combination."""
     train, trajectories = config.train, config.data.trajectories
     _check_own_data(config)
     if train.batch_size % train.part_size:
@@ -379,7 +385,7 @@ def check_pretraining(config: PretrainConfig) -> None:
 
 
 def _check_own_data(config: PretrainConfig) -> None:
-    """Raise ``UsageError`` for settings that have no use with data of one's own, or need it."""
+    """Raise ``UsageError`` for settings that make no sense with, or without, the user's own dataset."""
     data = config.data
     if data.data_folder is None:
         if config.env == NO_WORLD:
@@ -402,7 +408,7 @@ def _check_own_data(config: PretrainConfig) -> None:
 
 
 def check_initial(config: PretrainConfig) -> None:
-    """Raise ``UsageError`` for settings of a network that the policy to start from was not made for."""
+    """Raise ``UsageError`` for network settings that contradict those of the initial policy."""
     folder, network = initial_folder(config), read_initial(config).network
     given = {name: getattr(config, name) for name in network}
     mend = "leave it out" if folder == config.init else mend_initial(config)
@@ -415,12 +421,12 @@ NO_SETTINGS = frozenset(
         "eval_every", "save_every", "data_folder", *OF_PROCESSES,
     }
 )  # fmt: skip
-"""Settings that may differ when a run is resumed: they do not change its weights. For the places of data
-and of the policy to start from, their hashes count."""
+"""Settings that may change when a run is resumed, because they do not affect its weights. Datasets and
+initial policies are compared by hash instead of by path."""
 
 
 def training_settings(config: PretrainConfig) -> dict[str, Any]:
-    """The settings that determine the result of a training, by the names of their flags, as JSON values."""
+    """The settings that determine the result of a training, by name, as JSON values."""
     settings = dataclasses.asdict(config)
     parts = {**settings, **settings["data"], **settings["train"]}
     return {k: v for k, v in parts.items() if k not in NO_SETTINGS | {"data", "train"}}
@@ -430,7 +436,7 @@ def saved_pretraining(path: Path) -> PretrainConfig:
     """The settings in the ``config.json`` of a run.
 
     Raises:
-      DataError: if they are no settings of a pre-training run.
+      DataError: if the file does not hold settings of a pre-training run.
     """
     return pretraining_from(read_document(path, dict[str, Json], MEND_RUN), path)
 
@@ -439,14 +445,14 @@ MEND_RUN = "restore the file, or start a new run with --out"
 
 
 def pretraining_from(values: Mapping[str, Any], where: Path) -> PretrainConfig:
-    """The settings of a run from JSON values, also of one that was made with older names.
+    """The settings of a run from JSON values, in which older names of settings are accepted.
 
     Args:
-      values: the values; what is missing has its default.
-      where: the file that they are from, for messages.
+      values: the values; missing settings get their defaults.
+      where: the file that they are from, for error messages.
 
     Raises:
-      DataError: if they are no settings of a pre-training run.
+      DataError: if they are not the settings of a pre-training run.
     """
     if "env" not in values:
         raise DataError(f"{where} lacks env; {MEND_RUN}")
@@ -458,7 +464,7 @@ def pretraining_from(values: Mapping[str, Any], where: Path) -> PretrainConfig:
 
 
 def _from_json(settings_class: type, values: Any, where: Path) -> Any:
-    """A dataclass of settings from JSON values; ``DataError`` names the first that is wrong."""
+    """A settings dataclass from JSON values; the ``DataError`` names the first invalid one."""
     if not isinstance(values, Mapping):
         raise DataError(f"{where} holds no settings of a pre-training run; {MEND_RUN}")
     types = types_of(settings_class)
@@ -483,47 +489,49 @@ class AdaptConfig(Joined):
     env: Name = DEFAULT_WORLD
     """The world, by name or as module:attribute (``python -m experiments.list`` shows the names)."""
     method: Annotated[Name, tyro.conf.arg(aliases=("--bandit",))] = "ucb"
-    """Who adapts, by name or as module:attribute (``python -m experiments.list`` shows the names)."""
+    """The adaptation method, by name or as module:attribute (``python -m experiments.list`` shows the
+    names)."""
     policy: Path | None = None
-    """Folder of a policy (default: the released one of the world)."""
+    """Folder of a policy (default: the world's released policy)."""
     tasks: Path | None = None
-    """Your own tasks, an npz file with one array for each field of the world's task (default: the test
-    tasks of the world)."""
+    """Your own tasks, an npz file with one array for each field of the world's tasks (default: the world's
+    test tasks)."""
     validation: bool = False
-    """Adapt to as many tasks that are no test tasks, to choose a method's settings by."""
+    """Adapt to validation tasks instead of the test tasks, to choose a method's settings."""
     validation_seed: Seed = 0
-    """Which validation tasks: those of 0 watch trainings, too; those of other seeds are none of them."""
+    """Random seed of the validation tasks; seed 0 gives those that trainings are evaluated on."""
     seeds: NumSeeds = 3
-    """Independent adaptations to each task [3]."""
+    """Number of independent adaptations to each task [3]."""
     episodes: NumEpisodes = 100
-    """Budget of episodes a task, the first evaluation of (g^M) included [100]."""
+    """Episode budget per task, including the first episode, under the prompt (g^M) [100]."""
     seed: Seed = 0
-    """Seed of the adaptations."""
+    """Random seed of the adaptations."""
     eval_every: Count = 10
-    """Episodes between evaluations of the best choice, which are outside of the budget."""
+    """Episodes between evaluations of the best choice so far; they do not count toward the budget."""
     eval_episodes: NumEpisodes | None = None
-    """Episodes that an evaluation averages (default: as the world's record says)."""
+    """Episodes averaged in an evaluation (default: from the world's record)."""
     stop_at: Finite | None = None
-    """End the search of a task as soon as its best choice is evaluated at this return or more."""
+    """Stop searching on a task once its best choice so far reaches this return in an evaluation."""
     obs_noise: NotNegative = 0.0
-    """Standard deviation of noise on observations, in their units: search and evaluations run behind it."""
+    """Standard deviation of the noise on observations, in their units, during search and evaluation."""
     action_noise: NotNegative = 0.0
-    """That of noise on actions; where they are discrete, the probability of a random one."""
+    """Standard deviation of the noise on continuous actions; the probability of a random action for
+    discrete ones."""
     sweep: tuple[str, ...] = ()
-    """Numbers among the method's hyper-parameters with several values each, such as ``c=0.1,1,10``: all of
-    them, crossed, are one program and one table."""
+    """Values of numeric hyper-parameters of the method to sweep over, such as ``c=0.1,1,10``; several
+    hyper-parameters form a grid."""
     keep_actions: bool = False
-    """Also keep continuous actions in the results; discrete ones are always kept."""
+    """Also store continuous actions in the results; discrete ones are always stored."""
     out: Path | None = None
-    """Result folder (default: runs/adapt/ENV/METHOD-seedSEED, with the noise behind it)."""
+    """Result folder (default: runs/adapt/ENV/METHOD-seedSEED, plus a suffix for noise or a sweep)."""
     figures: bool = True
-    """Draw the figures."""
+    """Draw figures of the results."""
     json: bool = False
     """Print the summary as JSON."""
     dry_run: bool = False
-    """Only say what would be done, and some CPU time that it takes."""
+    """Print what would be done and examples of the CPU time it takes, then exit."""
     resume: bool = False
-    """Go on with an adaptation that was stopped; the result is the same as without a stop."""
+    """Continue an interrupted adaptation; the result is the same as that of an uninterrupted one."""
     hyper: Annotated[Any, tyro.conf.arg(name="")] = field(default_factory=NoHyper)
     """Hyper-parameters of the method."""
 
@@ -541,34 +549,33 @@ class ReproduceConfig(Joined):
     """Settings of ``experiments.reproduce``."""
 
     what: tyro.conf.Positional[str] = ""
-    """table1, table2, table8 (methods in all worlds), figure6, figure7 (the same with their curves), table3
-    (optimized prompts behind noise), figure2, figure3, figure5, figure9, figure10 (prompts and what is done
-    under them), figure11 (the worlds at a glance), table4 (prompt length and c of UCB), table5 (datasets),
-    figure8 (longer prompts), heads (distributions of continuous actions), plan (the own optimizer without
-    some of its parts), list (what is there of each, and
-    what the rest costs), or all (everything that is missing)."""
+    """What to make: table1, table2, table8 (methods in all worlds), figure6, figure7 (their learning
+    curves), table3 (optimized prompts under noise), figure2, figure3, figure5, figure9, figure10 (prompts
+    and the episodes under them), figure11 (the worlds at a glance), table4 (prompt length and c of UCB),
+    table5 (datasets), figure8 (longer prompts), heads (distributions of continuous actions), plan (our
+    optimizer without some of its parts), list (what exists of each, and the cost of the rest), or all
+    (everything that is missing)."""
     env: tuple[Name, ...] = ()
-    """The worlds, by name or as module:attribute (default: those of the paper's table or figure; of an
-    ablation, maze15; of figure11, all)."""
+    """The worlds, by name or as module:attribute (default: those of the paper's table or figure; maze15 for
+    ablations; all for figure11)."""
     scale: Literal["smoke", "cpu", "paper"] = "cpu"
-    """Of what compares methods or draws adaptations: cpu has the released networks and the paper's budget,
-    smoke five tasks, one seed and 20 episodes, and paper networks that are trained by the preset of that
-    name."""
+    """Scale of comparisons and of drawn adaptations: cpu uses the released networks and the paper's budget;
+    smoke five tasks, one seed and 20 episodes; paper networks trained with the preset "paper"."""
     only: tuple[Name, ...] = ()
-    """Names of the datasets (table5), prompt lengths (figure8) or heads to train, or of the methods of a
-    comparison (default: all)."""
+    """Names of the datasets (table5), prompt lengths (figure8) or heads to train, or of the methods to
+    compare (default: all)."""
     steps: Count | None = None
-    """Gradient steps of each training (default: those of the world's preset "ablation")."""
+    """Gradient steps of each training (default: from the world's preset "ablation")."""
     trajectories: Annotated[NumTrajectories | None, tyro.conf.arg(aliases=("--episodes",))] = None
-    """Trajectories of each dataset (default: those of the world's preset "ablation")."""
+    """Trajectories in each dataset (default: from the world's preset "ablation")."""
     seeds: NumSeeds = 3
-    """Independent adaptations to each test task [3]."""
+    """Number of independent adaptations to each test task [3]."""
     out: Path = RUNS / "reproduce"
-    """Folder of all trainings and results; tables share what they have in common."""
+    """Folder of all trainings and results, which tables and figures share where they can."""
 
     @property
     def world(self) -> str:
-        """The one world of an ablation."""
+        """The world of an ablation, which has only one."""
         return self.env[0] if self.env else DEFAULT_WORLD
 
     @property
@@ -589,20 +596,20 @@ class ReproduceConfig(Joined):
 
 
 COMPARISONS = ("table1", "table2", "table3", "table8", "figure6", "figure7")
-"""What ``experiments.reproduce`` makes of several methods in several worlds."""
+"""Tables and figures of ``experiments.reproduce`` that compare several methods in several worlds."""
 PICTURES = ("figure2", "figure3", "figure5", "figure9", "figure10")
-"""What it draws of adaptations."""
+"""Figures that draw episodes of adaptations."""
 ABLATIONS = ("table4", "table5", "figure8", "heads", "plan")
-"""What it varies one thing for."""
+"""Studies that vary one factor in one world."""
 TRAIN_NOTHING = ("table4", "plan")
-"""Those of them that adapt the released policy."""
+"""Ablations that adapt the released policy instead of training policies of their own."""
 GLANCE = "figure11"
-"""The picture of all worlds."""
+"""The figure that shows all worlds."""
 LIST, ALL = "list", "all"
 
 
 def check_reproduction(config: ReproduceConfig) -> None:
-    """Raise ``UsageError`` for settings of ``experiments.reproduce`` that do not go together."""
+    """Raise ``UsageError`` for a combination of settings that ``experiments.reproduce`` has no use for."""
     if config.distributed and config.what not in COMPARISONS:
         raise UsageError(
             f"--distributed spreads the cells of a comparison; {config.what} is made by one process, leave "
@@ -625,7 +632,7 @@ def check_reproduction(config: ReproduceConfig) -> None:
 
 
 def _refuse(config: ReproduceConfig, names: Iterable[str]) -> None:
-    """Raise ``UsageError`` for the first of some settings that is given and has no use."""
+    """Raise ``UsageError`` for the first of some useless settings that is given."""
     for name in names:
         if value := getattr(config, name):
             raise UsageError(
