@@ -1,9 +1,9 @@
-"""Speed of the hot paths, in CPU time: ``python -m experiments.bench``.
+"""Measure the speed of the hot paths in CPU time: ``python -m experiments.bench``.
 
-CPU time of the process, not wall time, so that a shared machine and the number of cores matter little;
-the machine's own matrix-product rate, measured in the same run between the rows, stands beside them.
-With ``--distributed`` the processes share the work, and their CPU time is added; ``--layouts`` starts such
-processes on this machine and shows what each way to divide it costs.
+CPU time is used instead of wall time, so that other load and the number of cores matter little. The
+machine's rate of matrix multiplication is measured between the rows, for comparison. With ``--distributed``
+the processes share the work, and their CPU times are added; ``--layouts`` starts such processes on this
+machine and compares ways to divide it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from experiments.store.settings import DEFAULT_WORLD
 from mgpo_jax import processes
 from mgpo_jax.settings import Name, NumTrajectories
 
-COLUMNS = (18, 10, 18, 0)  # widths of name, value, unit and note, which are printed one by one
+COLUMNS = (18, 10, 18, 0)  # widths of name, value, unit and note
 
 
 @dataclass(frozen=True)
@@ -35,18 +35,19 @@ class BenchConfig(Joined):
     env: Name = DEFAULT_WORLD
     """The world, by name or as module:attribute."""
     demonstrator: Annotated[Name | None, tyro.conf.arg(aliases=("--policy",))] = None
-    """Whose demonstrations to collect and train on (default: those of the recipe)."""
+    """The demonstrator to collect and train on (default: that of the world's preset)."""
     quick: bool = False
-    """A tenth of the work: shows that it runs, gives rough numbers."""
+    """Do a tenth of the work, for rough numbers."""
     trajectories: Annotated[NumTrajectories | None, tyro.conf.arg(aliases=("--episodes",))] = None
-    """Trajectories to collect (default: 5,000; quick: 500)."""
+    """Number of trajectories to collect (default: 5,000, or 500 with ``--quick``)."""
     rows: Literal["all", "shared", "step"] = "all"
-    """Which rows: shared leaves out what processes do not share, step ends with the gradient step."""
+    """Rows to measure: all; shared, those whose work processes share; step, those up to the gradient
+    step."""
     layouts: tuple[str, ...] = ()
-    """Ways to divide this machine, such as ``1x2 2x1 1x8``: so many processes with so many devices each.
-    Shown are the rows that they share, or with ``--rows step`` those up to the gradient step."""
+    """Ways to divide this machine, as PROCESSESxDEVICES (devices per process), such as ``1x2 2x1 1x8``;
+    measures the shared rows, or with ``--rows step`` those up to the gradient step."""
     json: Path | None = None
-    """Also write the rows to this file."""
+    """JSON file to write the rows to."""
 
 
 def main(config: BenchConfig) -> None:
@@ -82,7 +83,7 @@ def main(config: BenchConfig) -> None:
 
 
 def show_layouts(config: BenchConfig) -> None:
-    """The shared rows of the bench for each way to divide the machine."""
+    """Measure and print the rows of the bench for each layout."""
     from experiments.store.tables import aligned
     from mgpo_jax.files import write_json
 

@@ -1,8 +1,8 @@
 """The paper's comparisons of methods in several worlds (Tables 1, 2 and 8; Figures 6 and 7), cell by cell.
-Table 3 has the same cells (``experiments.robustness``).
 
-A cell is one adaptation, which lies in a folder of its own and can be resumed by itself. What was published
-under ``results/`` is taken from there if it is of the same weights, tasks and settings.
+A cell is one adaptation, which has its own folder and can be resumed on its own. Published results under
+``results/`` are used if they were made with the same weights, tasks and settings. Table 3
+(``experiments.robustness``) has the same cells.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ class Comparison:
     """What a table of the paper compares.
 
     Attributes:
-      title: what it is.
-      methods: those that the paper has.
-      further: ours beside them: variants, and references that learn nothing.
+      title: title of the table.
+      methods: the paper's methods.
+      further: our additions: variants, our own optimizer, and baselines that learn nothing.
     """
 
     title: str
@@ -83,17 +83,17 @@ TABLES: Mapping[str, Comparison] = {
     ),
 }  # fmt: skip
 CURVES_OF = {"figure6": "table1", "figure7": "table2"}
-"""The tables whose learning curves the figures are."""
+"""Figures of learning curves, and the tables of the same adaptations."""
 
 
 class Picture(NamedTuple):
-    """A figure of prompts, or of what is done under them."""
+    """A figure of prompts, or of episodes under them."""
 
     methods: tuple[str, ...]
     pattern: str
-    """Of the names of its files among those that ``experiments.plot`` draws."""
+    """Glob pattern of its file names among those that ``experiments.plot`` draws."""
     numbers: Callable[[Results], str] | None = None
-    """A table of an adaptation that says in numbers what the figure shows, in Markdown."""
+    """Makes a Markdown table of the numbers that the figure shows, from the results of an adaptation."""
 
 
 PICTURES: Mapping[str, Picture] = {
@@ -111,14 +111,14 @@ class Cell(NamedTuple):
     world: str
     method: str
     results: Path | None
-    """Its folder; None where it cannot be had."""
+    """Its result folder; None if it is not available."""
     reason: str = ""
-    """Why it cannot be had."""
+    """Why it is not available."""
 
 
 @dataclass(frozen=True)
 class Notes:
-    """What a table says below its rows, each line once."""
+    """The notes below a table, without duplicates."""
 
     lines: list[str] = field(default_factory=list)
 
@@ -128,20 +128,20 @@ class Notes:
 
 
 def worlds_of(config: ReproduceConfig) -> Sequence[str]:
-    """The worlds of a comparison: those that are asked for, or the paper's."""
+    """The worlds of a comparison: those given by ``--env``, or the paper's."""
     return config.env or paper_worlds(CURVES_OF.get(config.what, config.what))
 
 
 def table_of(config: ReproduceConfig) -> Comparison:
-    """What is compared."""
+    """The comparison that a table or figure shows."""
     return TABLES[CURVES_OF.get(config.what, config.what)]
 
 
 def methods_of(config: ReproduceConfig) -> Sequence[str]:
-    """The methods of a comparison, those that ``--only`` leaves.
+    """The methods of a comparison: those given by ``--only``, or all.
 
     Raises:
-      UsageError: for one that the comparison does not have.
+      UsageError: for a method that the comparison does not have.
     """
     comparison = table_of(config)
     known = (*comparison.methods, *comparison.further)
@@ -152,7 +152,7 @@ def methods_of(config: ReproduceConfig) -> Sequence[str]:
 
 
 def num_seeds(config: ReproduceConfig) -> int:
-    """Independent adaptations to each task."""
+    """The number of independent adaptations to each task."""
     return 1 if config.scale == "smoke" else config.seeds
 
 
@@ -177,15 +177,15 @@ def cell_config(config: ReproduceConfig, world: str, method: str) -> AdaptConfig
 
 
 def _trained_policy(config: ReproduceConfig, world: str, method: str) -> Path:
-    """Where the network of the preset "paper" lies that a method starts from."""
+    """The folder of the policy, trained with the preset "paper", that a method starts from."""
     kind = methods.find(method).policy
     return config.out / file_name(world) / "policies" / f"paper-{kind}" / runs.POLICY
 
 
 def made(config: ReproduceConfig, world: str, method: str) -> Cell:
-    """A cell that is there: published, finished before, or adapted now.
+    """Get a cell: from published or earlier results, or by adapting now.
 
-    Worlds that are not installed and networks that are not released make it an empty one.
+    If the world is not installed or its policy is not released, the cell is empty.
     """
     settings = cell_config(config, world, method)
     if (place := published(config, settings)) is not None:
@@ -210,7 +210,7 @@ def made(config: ReproduceConfig, world: str, method: str) -> Cell:
 
 
 def _train(folder: Path, world: str, kind: str) -> None:
-    """Train a network by the preset "paper", or go on with its training."""
+    """Run or continue the training of a network with the preset "paper", unless it is finished."""
     if runs.is_finished(folder):
         return
     preset = pretrain_preset(world, "paper", kind)
@@ -219,7 +219,7 @@ def _train(folder: Path, world: str, kind: str) -> None:
 
 
 def published(config: ReproduceConfig, settings: AdaptConfig) -> Path | None:
-    """The published results of the settings of a cell; None if there are none, or others."""
+    """The folder of published results with the settings of a cell; None if there are none."""
     folder = PUBLISHED / file_name(settings.env) / file_name(settings.method)
     if config.scale != "cpu" or not folder.is_dir():
         return None
@@ -235,17 +235,17 @@ def published(config: ReproduceConfig, settings: AdaptConfig) -> Path | None:
 
 
 def cells(config: ReproduceConfig) -> Iterator[Cell]:
-    """All cells of a comparison, world by world; each is made when it is asked for."""
+    """Yield all cells of a comparison, world by world; each is made when it is requested."""
     for world in worlds_of(config):
         for method in methods_of(config):
             yield made(config, world, method)
 
 
 def share_out(config: ReproduceConfig) -> None:
-    """Make the cells of a comparison that are missing, each in one of the processes that work together.
+    """Distribute the missing cells of a comparison over the processes, each of which makes its share.
 
-    They need a folder that all of them see. Cells that start from the same trained network are made by the
-    same process. One process by itself makes them when the table asks for them.
+    The processes need a shared folder. Cells that start from the same trained network go to the same
+    process. A single process does nothing here: it makes the cells when the table requests them.
     """
     if processes.count() == 1:
         return
@@ -307,18 +307,18 @@ def _row(cell: Cell, scale: str, notes: Notes) -> list[str]:
 
 
 def gap(paper: str, ours: float) -> str:
-    """Ours minus the paper's number, with which its text begins; empty where the paper has nothing."""
+    """Our value minus the paper's, which is the first word of ``paper``; empty if the paper has none."""
     return f"{ours - float(paper.split()[0]):+.3f}" if paper else ""
 
 
 def files_of(config: ReproduceConfig) -> tuple[Path, Path]:
-    """Where the table and the curves of a comparison are written."""
+    """The files of a comparison's table and learning curves."""
     place = config.out / f"{config.what}-{config.scale}"
     return place.with_suffix(".md"), place.with_suffix(".png")
 
 
 def compare(config: ReproduceConfig) -> str:
-    """Make all cells that are missing, and write the table and the learning curves; returns the table."""
+    """Make all missing cells, and write the table and the learning curves; returns the table."""
     place, picture = files_of(config)
     check_replaceable((place, picture))
     found = list(cells(config))
@@ -341,11 +341,12 @@ def _curves(found: Sequence[Cell]) -> dict[str, dict[str, Any]]:
 
 
 def draw(config: ReproduceConfig) -> list[Path]:
-    """Draw a figure of prompts in each of its worlds, of adaptations that are made where they are missing.
+    """Draw a figure in each of its worlds, after making the adaptations that are missing.
 
-    Where the figure also has numbers, their table is printed and written beside it.
+    If the figure also has a table of numbers, the table is printed, and written beside the figure.
 
-    Returns the files.
+    Returns:
+      The files.
 
     Raises:
       UsageError: if a world or a network is missing, or a world draws no such figure.
@@ -354,7 +355,7 @@ def draw(config: ReproduceConfig) -> list[Path]:
 
 
 def _draw_in(config: ReproduceConfig, world: str) -> list[Path]:
-    """The files of a figure in one world."""
+    """Draw a figure in one world; returns its files."""
     figure, results = PICTURES[config.what], {}
     for method in figure.methods:
         cell = made(config, world, method)

@@ -1,6 +1,6 @@
-"""``--config FILE``: the settings of a run, from its ``config.json``, as words of a command line.
+"""``--config FILE``: take settings from the ``config.json`` of a run, as words of a command line.
 
-They stand where the user gave no flag, and are read and checked like words that were typed.
+Flags that the user typed take precedence. The added words are parsed and checked like typed ones.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from mgpo_jax.schema import Json, read_document
 from mgpo_jax.settings import flag, is_settings, types_of
 
 OWN = frozenset({"config", "debug", "dry_run", "json", "out", "quiet", "resume", *OF_PROCESSES})
-"""Settings of one call of a command, which another one does not take over."""
+"""Settings that belong to a single call of a command and are not taken from a file."""
 GROUPS = frozenset({"data", "train", "hyper"})
-"""Groups of settings in ``config.json``, whose flags are those of their members."""
+"""Nested settings in ``config.json``; each of their members has a flag."""
 CHOOSER = {"hyper": "method"}
-"""A group of no use where a setting is typed: hyper-parameters where another method is named."""
+"""Groups to skip if a setting is typed: a method's hyper-parameters if the user names a method."""
 
 
 def expanded(words: Sequence[str], config_class: type) -> list[str]:
-    """The words of a command line with those of the file that ``--config`` names after them.
+    """Append the settings of the file that ``--config`` names to a command line.
 
     Args:
-      words: what was typed.
-      config_class: the dataclass of the command's settings, for other names of its flags.
+      words: the words that were typed.
+      config_class: the dataclass of the command's settings, for the aliases of its flags.
 
     Raises:
       UsageError: if ``--config`` has no value.
@@ -59,7 +59,7 @@ def _file_in(words: Sequence[str]) -> Path | None:
 
 
 def _name_of(word: str) -> str:
-    """The setting that a word gives: ``no_figures`` and ``--figures`` are one; empty for a value."""
+    """The setting that a flag sets, such as ``figures`` for ``--no-figures``; empty for other words."""
     if not word.startswith("--"):
         return ""
     name = word.partition("=")[0].removeprefix("--").replace("-", "_")
@@ -67,7 +67,7 @@ def _name_of(word: str) -> str:
 
 
 def _names(config_class: type) -> dict[str, str]:
-    """Other names of settings, and the settings."""
+    """The aliases of settings, mapped to the settings."""
     found: dict[str, str] = {}
     config: Any = config_class()
     for field in dataclasses.fields(config):
@@ -80,7 +80,7 @@ def _names(config_class: type) -> dict[str, str]:
 
 
 def _settings(values: Mapping[str, Any], given: set[str]) -> Iterator[tuple[str, Any]]:
-    """Settings of the file that nobody typed; those of groups, too."""
+    """The settings in the file that were not typed, including those in groups."""
     for name, value in values.items():
         if name in GROUPS and isinstance(value, Mapping):
             if CHOOSER.get(name) not in given:

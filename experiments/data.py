@@ -1,7 +1,7 @@
 """Datasets of your own logs: ``python -m experiments.data import logs.hdf5 --goal-columns 0 1 --out mine``.
 
-``import`` makes a dataset of logs, ``export`` makes logs of a dataset, ``check`` says what is wrong with a
-dataset, and ``info`` what is in it.
+``import`` converts logs to a dataset, ``export`` converts a dataset to logs, ``check`` finds faults in a
+dataset, and ``info`` describes it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def main(config: DataCommandConfig) -> None:
 
 
 def import_logs(config: ImportConfig) -> None:
-    """Make a dataset of logs, which `experiments.pretrain --data FOLDER` trains on."""
+    """Convert logs to a dataset, which `experiments.pretrain --data FOLDER` trains on."""
     check_import(config)
     assert config.out is not None
     refuse_existing(config.out, "remove it", "choose another with --out")
@@ -45,7 +45,7 @@ def import_logs(config: ImportConfig) -> None:
 
 
 def export_logs(config: ExportConfig) -> None:
-    """Write a dataset as flat arrays in an npz file, or as a Minari dataset in a folder."""
+    """Export a dataset as flat arrays in an npz file, or as a Minari dataset in a folder."""
     folder = require_folder(config.folder, "export")
     if config.out is None:
         raise UsageError("--out is missing; give an npz file, or a folder for a Minari dataset")
@@ -60,7 +60,7 @@ def export_logs(config: ExportConfig) -> None:
 
 
 def check_data(config: CheckDataConfig) -> None:
-    """Say what is wrong with a dataset, one sentence for each finding; exits with 1 if anything is."""
+    """Report the faults of a dataset, one sentence for each; exits with 1 if there are any."""
     folder = require_folder(config.folder, "check")
     from experiments.soundness import examine
 
@@ -75,7 +75,7 @@ def check_data(config: CheckDataConfig) -> None:
 
 
 def show_info(config: InfoConfig) -> None:
-    """Say what is in a dataset: counts, lengths, shapes, spreads, sizes, and who made it."""
+    """Describe a dataset: counts, lengths, shapes, spreads, sizes, and origin."""
     folder = require_folder(config.folder, "info")
     from experiments.soundness import described
 
@@ -94,7 +94,7 @@ def command(argv: Sequence[str] | None = None) -> NoReturn:
     words = list(sys.argv[1:] if argv is None else argv)
     if words and words[0] in SUBCOMMANDS:
         run(SUBCOMMANDS[words[0]], RUNS[words[0]], argv=words[1:])
-    if words and not words[0].startswith("-"):  # no flag of a command can be right then
+    if words and not words[0].startswith("-"):  # an unknown subcommand: report it, not its flags
         words = words[:1]
     run(DataCommandConfig, main, argv=words)
 

@@ -1,4 +1,4 @@
-"""Figures of adaptations as files."""
+"""Draw figures of adaptations and write them to files."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ from mgpo_jax.prompts import prompt_of
 from mgpo_jax.rollout import Query
 
 Picture = tuple[str, Save]
-"""The name of a file, and what writes it."""
+"""A file name, and a function that writes the file."""
 
 
 def draw_run(world: World, results: Results, folder: Path) -> None:
-    """Draw into the folder of one adaptation what needs no policy.
+    """Draw the figures of one adaptation that need no policy into its folder.
 
-    A file there that no command wrote as it is stays, and a line on stderr says so.
+    A file that was changed, or was not written by a command, is kept, with a line on stderr.
     """
     curve = later(learning_curve, {results.method: results}, results.env)
     drawn = [("learning_curve.png", curve)]
@@ -56,7 +56,7 @@ def draw_run(world: World, results: Results, folder: Path) -> None:
 
 
 def is_kept(path: Path) -> bool:
-    """Whether a file stays since no command wrote it as it is, which a line on stderr then says."""
+    """Whether to keep a file, since it was changed or not written by a command; if so, says so on stderr."""
     if not is_foreign(path):
         return False
     print(
@@ -70,15 +70,15 @@ def is_kept(path: Path) -> bool:
 def pictures_together(
     results: Mapping[str, Results], tasks: Sequence[int], seed: int, policy: Path | None = None
 ) -> list[Picture]:
-    """Every figure of some adaptations to the same tasks of one world, with nothing drawn yet.
+    """The figures of some adaptations to the same tasks of one world, not drawn yet.
 
-    All that drawing needs is there when this returns: the world, its pictures, and the policies.
+    Everything that drawing needs is loaded when this returns: the world, its pictures, and the policies.
 
     Args:
       results: adaptations by their labels in legends.
-      tasks: the tasks to draw (none: those that the first adaptation improved most).
-      seed: which seed of the adaptations to draw.
-      policy: folder of the policy of all of them (default: where it lay when they were made).
+      tasks: indices of the tasks to draw (empty: those that the first adaptation improved most).
+      seed: index of the seed to draw.
+      policy: folder of the policy of all adaptations (default: the one that the results name).
     """
     first = next(iter(results.values()))
     drawn = [("learning_curve.png", later(learning_curve, results, first.env))]
@@ -86,7 +86,7 @@ def pictures_together(
     if world.pictures is not None:
         pictures = world.pictures(envs.make(first.env))
         for result in results.values():
-            result.task_set  # noqa: B018 (read and checked before anything is written)
+            result.task_set  # noqa: B018 (loads and checks the tasks before anything is written)
         which = tasks or first.most_improved()
         players = partial(player_of, policy_folder=policy)
         drawn += figures_of_results(pictures, results, players, which, seed)
@@ -94,7 +94,7 @@ def pictures_together(
 
 
 def player_of(results: Results, policy_folder: Path | None = None) -> Play:
-    """Who plays episodes under prompts: the policy that an adaptation was made with."""
+    """A function that runs episodes under prompts, with the policy that an adaptation was made with."""
     world, env = envs.find(results.env), results.environment
     policy = load_policy_of(results, world, policy_folder)
 
@@ -107,7 +107,7 @@ def player_of(results: Results, policy_folder: Path | None = None) -> Play:
 
 
 def labeled(folders: Mapping[Path, Results]) -> dict[str, Results]:
-    """Results by method name, and folder where one method ran more than once."""
+    """Results by label: the method's name, with the folder if several results are of the same method."""
     methods = [result.method for result in folders.values()]
     labels = [
         method if methods.count(method) == 1 else f"{method} ({folder})"
@@ -119,7 +119,7 @@ def labeled(folders: Mapping[Path, Results]) -> dict[str, Results]:
 def by_world(
     folders: Sequence[Path], load: Callable[[Path], Results]
 ) -> Iterator[dict[Path, Results]]:
-    """The results in some folders, world by world."""
+    """Load results and group them by world."""
     found: dict[str, dict[Path, Results]] = {}
     for folder in dict.fromkeys(folders):
         result = load(folder)
@@ -128,7 +128,7 @@ def by_world(
 
 
 def check_together(folders: Mapping[Path, Results], tasks: Sequence[int], seed: int) -> None:
-    """Raise ``UsageError`` for runs that no figure can compare, or that lack what is asked for."""
+    """Raise ``UsageError`` for runs on different tasks, or without the requested task or seed."""
     first_folder, first = next(iter(folders.items()))
     for folder, result in folders.items():
         if not same_tasks(result, first):
@@ -144,9 +144,9 @@ def check_together(folders: Mapping[Path, Results], tasks: Sequence[int], seed: 
 
 
 def write(path: Path, save: Save) -> None:
-    """Write one picture, whole or not at all, and say where it is."""
+    """Write a picture atomically, and print its path on stderr."""
     with mpl.rc_context(STYLE), warnings.catch_warnings():
-        # A name that the font cannot write is drawn as boxes.
+        # Characters that the font lacks are drawn as boxes.
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         write_sealed(path, save)
     print(printable(str(path)), file=sys.stderr)

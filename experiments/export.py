@@ -21,11 +21,12 @@ class ExportConfig(Common):
     env: Name = DEFAULT_WORLD
     """The world of the policy, by name or as module:attribute."""
     policy: Path | None = None
-    """Folder of the policy (default: the released one)."""
+    """Folder of the policy (default: the world's released policy)."""
     format: Literal["onnx"] = "onnx"
-    """What to write: ONNX, two models."""
+    """Output format: two ONNX models."""
     out: Path = Path("policy.onnx")
-    """File of the model of one step. The one that reads the prompt lies beside it, NAME_prefill.onnx."""
+    """Output file of the model of one step; the model that reads the prompt is written to
+    NAME_prefill.onnx beside it."""
 
 
 def main(config: ExportConfig) -> None:

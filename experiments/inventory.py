@@ -1,4 +1,4 @@
-"""What there is of all that ``experiments.reproduce`` makes, what it took, and what the missing costs."""
+"""``experiments.reproduce list``: which results exist, what they cost, and an estimate for the others."""
 
 from __future__ import annotations
 
@@ -51,20 +51,21 @@ HEAD = (
 
 
 class Piece(NamedTuple):
-    """A cell, or a training: whether it is there, and what it took or would take."""
+    """A cell or a training: whether it exists, and its cost."""
 
     there: bool
+    """Whether it is finished."""
     seconds: float | None
-    """CPU time; None if nothing is known that it could be estimated from."""
+    """CPU time that it took or would take; None if it cannot be estimated."""
     counts: bool = True
-    """Whether it is a cell of the table; a training only has a price."""
+    """Whether it counts as a cell of the table; trainings only add to the cost."""
 
 
 def jobs(config: ReproduceConfig) -> list[ReproduceConfig]:
-    """What ``reproduce all`` makes, one after the other, with the worlds of each.
+    """The jobs of ``reproduce all`` in order, each with its worlds.
 
-    Tables of methods have all worlds in one table, everything else is made in one world at a time. Only the
-    scale ``cpu`` has ablations, whose trainings have budgets of their own.
+    Tables of methods cover all worlds; everything else is made for one world at a time. Ablations only
+    exist at the scale ``cpu``, since their trainings have budgets of their own.
     """
     scaled = ABLATIONS if config.scale == "cpu" else ()
     tables = [replace(config, what=name) for name in COMPARISONS]
@@ -77,12 +78,12 @@ def jobs(config: ReproduceConfig) -> list[ReproduceConfig]:
 
 
 def worlds_of_job(config: ReproduceConfig) -> Sequence[str]:
-    """The worlds of a table, figure or ablation: those asked for, or the paper's, or the default one."""
+    """The worlds of a table, figure or ablation: those of ``--env``, else the paper's or the default."""
     return worlds_of(config) or (DEFAULT_WORLD,)
 
 
 def inventory(config: ReproduceConfig) -> str:
-    """What there is of each table, figure and ablation in each world, and what it takes, in Markdown."""
+    """A Markdown table of what exists of each table, figure and ablation in each world, and of its cost."""
     rows = []
     for job in jobs(config):
         if job.what == GLANCE:
@@ -100,7 +101,7 @@ def inventory(config: ReproduceConfig) -> str:
 
 
 def told(pieces: Sequence[Piece]) -> tuple[str, str, str]:
-    """How many cells are there, the minutes of what is there, and an estimate for what is not."""
+    """How many cells exist, their CPU-minutes, and an estimate for the missing ones."""
     cells = [piece for piece in pieces if piece.counts]
     spent = sum(piece.seconds or 0.0 for piece in pieces if piece.there) / 60
     missing = [piece.seconds for piece in pieces if not piece.there]
@@ -115,10 +116,10 @@ def pieces_of(config: ReproduceConfig, world: str) -> Iterator[Piece]:
     """The cells of a table, figure or ablation in one world, and the trainings that they need.
 
     Raises:
-      UsageError: if there is nothing like it in this world.
+      UsageError: if it is not available in this world.
     """
     if config.what in ablations.PLANS:
-        yield from _of_ablation(replace(config, env=(world,)))
+        yield from _ablation_pieces(replace(config, env=(world,)))
         return
     names = PICTURES[config.what].methods if config.what in PICTURES else methods_of(config)
     for name in names:
@@ -127,7 +128,7 @@ def pieces_of(config: ReproduceConfig, world: str) -> Iterator[Piece]:
             yield piece
             continue
         yield piece._replace(counts=False)
-        yield from _behind_noise(config, cell)
+        yield from _noise_pieces(config, cell)
 
 
 def _cell(config: ReproduceConfig, world: str, method: str) -> tuple[Cell, Piece]:
@@ -136,13 +137,13 @@ def _cell(config: ReproduceConfig, world: str, method: str) -> tuple[Cell, Piece
     if folder is not None:
         piece = Piece(True, read_summary(folder)["cpu_seconds"])
     elif settings.policy is not None and not runs.is_finished(settings.policy.parent):
-        piece = Piece(False, None)  # what the training of its policy takes is not known
+        piece = Piece(False, None)  # the cost of training its policy is unknown
     else:
         piece = Piece(False, _estimate(config, settings))
     return Cell(world, method, folder), piece
 
 
-def _behind_noise(config: ReproduceConfig, cell: Cell) -> Iterator[Piece]:
+def _noise_pieces(config: ReproduceConfig, cell: Cell) -> Iterator[Piece]:
     rate = seconds_per_episode(cell.world, methods.find(cell.method))
     episodes = _num_tasks(config, cell.world) * num_seeds(config)
     episodes *= robustness.num_episodes(config)
@@ -153,7 +154,7 @@ def _behind_noise(config: ReproduceConfig, cell: Cell) -> Iterator[Piece]:
             yield Piece(False, None if rate is None else rate * episodes)
 
 
-def _of_ablation(config: ReproduceConfig) -> Iterator[Piece]:
+def _ablation_pieces(config: ReproduceConfig) -> Iterator[Piece]:
     trainings: dict[Path, PretrainConfig] = {}
     for part in ablations.PLANS[config.what](config):
         if part.training is not None:
@@ -172,14 +173,14 @@ def _of_ablation(config: ReproduceConfig) -> Iterator[Piece]:
 
 
 def price_of(training: PretrainConfig) -> float | None:
-    """CPU-seconds of a training at the speed of the released policy's; None where there is none."""
+    """CPU-seconds of a training at the speed of the released policy's training; None if that is unknown."""
     place = released_folder(envs.find(training.env), training.method)
     seconds, steps = _seconds_in(place), _steps_in(place)
     return None if seconds is None or not steps else seconds / steps * training.train.steps
 
 
 def _seconds_in(folder: Path) -> float | None:
-    """CPU-seconds of the steps of a training, from its metrics; None if they do not tell them."""
+    """CPU-seconds of a training's gradient steps, from its metrics; None if they are not recorded."""
     rows = _metrics(folder)
     if not rows or any("cpu_seconds_per_step" not in row for row in rows):
         return None
@@ -207,7 +208,7 @@ def _num_tasks(config: ReproduceConfig, world: str) -> int:
 
 
 def _estimate(config: ReproduceConfig, settings: AdaptConfig) -> float | None:
-    """CPU-seconds of an adaptation at the speed of published ones; None where there are none like it."""
+    """CPU-seconds of an adaptation at the speed of similar published ones; None if there are none."""
     world = envs.find(settings.env)
     rate = seconds_per_episode(settings.env, methods.find(settings.method))
     judgements = 1 + ceil(settings.episodes / settings.eval_every)
@@ -217,10 +218,10 @@ def _estimate(config: ReproduceConfig, settings: AdaptConfig) -> float | None:
 
 
 def seconds_per_episode(world: str, method: Method) -> float | None:
-    """CPU-seconds of an episode in the published adaptations of a world; None where none is like it.
+    """CPU-seconds per episode in the published adaptations in a world; None if none are similar.
 
-    Those of the same method count, else the mean of those that learn in the same way. A method that learns
-    nothing only acts: it costs at most what the cheapest of all does.
+    This is the rate of the same method, or else the mean over methods that learn in the same way. A method
+    that learns nothing costs at most as much as the cheapest of all.
     """
     rates = _rates_in((PUBLISHED / file_name(world)).absolute())
     if method.name in rates:
@@ -232,13 +233,13 @@ def seconds_per_episode(world: str, method: Method) -> float | None:
 
 
 def way_of(method: Method) -> tuple[str, type]:
-    """How a method learns: the kind of its network, and the hyper-parameters that its relatives share."""
-    return method.policy, method.hyper.__mro__[-2]  # the last one is object
+    """How a method learns: the kind of its network, and the base class of its hyper-parameters."""
+    return method.policy, method.hyper.__mro__[-2]  # the last class is object
 
 
 @cache
 def _rates_in(folder: Path) -> Mapping[str, float]:
-    """CPU-seconds of an episode in the adaptations that a folder holds, by the names of their methods."""
+    """CPU-seconds per episode of the adaptations in a folder, by method."""
     return {
         name: 1 / read_summary(folder / file_name(name))["episodes_per_cpu_second"]
         for name in methods.names()

@@ -1,4 +1,4 @@
-"""A pre-training run: dataset, gradient steps, checkpoints, evaluations on the way, and the policy."""
+"""Pre-training runs: the dataset, gradient steps, checkpoints, evaluations, and the trained policy."""
 
 from __future__ import annotations
 
@@ -72,15 +72,15 @@ from mgpo_jax.training import (
 )
 from mgpo_jax.transformer import NetworkConfig, TransformerConfig, world_side
 
-CONSTANT = 1e-4  # below this standard deviation a component of an observation stays unscaled
-PERFECT = 1e-3  # a demonstration whose return is this near to the optimum counts as perfect
+CONSTANT = 1e-4  # observation components with a smaller standard deviation are not scaled
+PERFECT = 1e-3  # demonstrations whose return is this close to the optimum count as perfect
 
 
 def initial_policy(config: PretrainConfig, spec: EnvSpec) -> LoadedPolicy | None:
     """The policy that a run starts from; None if it starts from random weights.
 
     Raises:
-      UsageError: if there is none at its place, or the settings contradict its network.
+      UsageError: if there is no policy in the folder, or the settings contradict its network.
       DataError: if it is damaged, of another world, or not the one that a resumed run started from.
     """
     if config.init is None:
@@ -105,9 +105,14 @@ def configured_network(
     init: LoadedPolicy | None = None,
     spec: EnvSpec | None = None,
 ) -> Any:
-    """The network of a run: that of the policy it starts from, or one of the settings both configs have.
+    """The network config of a run: that of the policy that it starts from, or one made of its settings.
 
-    Where there is no world, ``spec`` says what the data is like.
+    Args:
+      config: settings of the run.
+      env: the world; None for a dataset without one.
+      dataset: the dataset, for the moments of the observations.
+      init: the policy that the run starts from, if any.
+      spec: describes the data if there is no world.
     """
     if init is not None:
         return replace(init.config, dropout=config.dropout)
@@ -123,7 +128,7 @@ def configured_network(
 
 
 def sized_network(config: PretrainConfig, spec: EnvSpec) -> Any:
-    """The network of the settings, without what follows from the data."""
+    """The network config that the settings imply, without anything that depends on the data."""
     learned = KINDS.find(config.method).load()
     common = {f.name for f in fields(learned.config)} & {f.name for f in fields(PretrainConfig)}
     sizes = {name: getattr(config, name) for name in common}
@@ -131,10 +136,10 @@ def sized_network(config: PretrainConfig, spec: EnvSpec) -> Any:
 
 
 def moments(obs: np.ndarray, piece: int = 1 << 24) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation of every component of observations, float64 [D].
+    """Mean and standard deviation of each component of the observations, float64 [D].
 
-    They are added up in the order of the rows, ``piece`` numbers at a time: the result has the bits of
-    ``numpy.mean`` and ``numpy.std`` where D is above 1, and needs little memory beside a mapped array.
+    Rows are added up in order, ``piece`` numbers at a time, so that a memory-mapped array needs little
+    memory. The result equals ``numpy.mean`` and ``numpy.std`` bit for bit if D is above 1.
 
     Args:
       obs: observations [N, ...].
@@ -156,14 +161,15 @@ def moments(obs: np.ndarray, piece: int = 1 << 24) -> tuple[np.ndarray, np.ndarr
 
 
 class ReturnsOnTheWay:
-    """Mean returns on tasks of its own, none of them a test task, where the data were collected.
+    """Evaluates a policy during training: mean returns on evaluation tasks, none of which is a test task.
 
-    The policy acts as the world judges, greedily unless its record says otherwise, in one episode a task.
+    The policy runs one episode per task in the world that the data was collected in. It acts greedily,
+    unless the world's record says that policies are judged by sampled actions.
 
-    ``initial`` is the return of the prompt (g^M); ``followed`` that of a prompt drawn from a perfect
-    demonstration of the task, which says how well the policy does what a good prompt tells it. The latter
-    is missing where most demonstrations are not perfect (in mazes the demonstrator goes after goals of its
-    own) and where the optimum is unknown. Where the world has variants, each has its own mean as well.
+    ``initial_return`` is the return under the prompt (g^M). ``followed_return`` is that under a prompt
+    drawn from a perfect demonstration of the task, which shows how well the policy follows a good prompt.
+    It is missing if the optimum is unknown, or if most demonstrations are not perfect (in mazes,
+    demonstrators pursue goals of their own). If the world has variants, each has its own means as well.
     """
 
     def __init__(
@@ -184,7 +190,7 @@ class ReturnsOnTheWay:
         def demonstrated(
             key: PRNGKeyArray, key_prompt: PRNGKeyArray, task: Task, weights: Any
         ) -> tuple[Prompt, Array]:
-            assert demonstrator is not None  # else nothing is demonstrated
+            assert demonstrator is not None  # else this is never called
             episode = run_episode(key, place, demonstrator.agent(weights), task)
             goals = episode.trajectory.goals
             confirmed = goals.goal_reached & (episode.rewards > 0)
@@ -201,7 +207,7 @@ class ReturnsOnTheWay:
             self.tasks
         )
         self._perfect = np.zeros(num, bool)
-        # Elsewhere nobody demonstrates, or nobody knows which demonstrations are perfect.
+        # Otherwise there are no demonstrations, or it is unknown which of them are perfect.
         if demonstrator is not None and np.isfinite(self.optimum).all():
             demonstrate = together(place, demonstrated, in_axes=(0, 0, 0, None))
             self._followed, returns = demonstrate(
@@ -210,7 +216,7 @@ class ReturnsOnTheWay:
             self._perfect = np.asarray(returns > self.optimum - PERFECT)
 
     def __call__(self, params: Any) -> dict[str, float]:
-        """The numbers for some weights."""
+        """The metrics of some weights."""
         initial = np.asarray(self._returns(params, self.keys[2], self.tasks, self._initial))
         everything = np.ones(len(initial), bool)
         found = self._means("eval/initial_return", initial, everything)
@@ -222,13 +228,13 @@ class ReturnsOnTheWay:
         return found
 
     def _means(self, name: str, values: np.ndarray, counts: np.ndarray) -> dict[str, float]:
-        """The mean of what counts, of all tasks and of those of each variant."""
+        """The mean over the tasks that count, and over those of each variant."""
         groups = {"": counts, **{tail: counts & one for tail, one in self._variants.items()}}
         return {name + tail: float(values[one].mean()) for tail, one in groups.items() if one.any()}
 
 
 def _variants(demonstrator: Demonstrator | None, tasks: Task) -> dict[str, np.ndarray]:
-    """Which tasks are of which variant of the world, by the ends of the names of metrics."""
+    """Masks of the tasks of each variant of the world, by the suffix of its metrics' names."""
     if demonstrator is None:
         return {}
     variants = np.asarray(jax.vmap(demonstrator.variant)(tasks))
@@ -236,11 +242,11 @@ def _variants(demonstrator: Demonstrator | None, tasks: Task) -> dict[str, np.nd
 
 
 class ReturnsByItself:
-    """Mean returns of a network that follows no prompts, as its kind says, on tasks of its own."""
+    """Evaluates a network without prompts during training: its mean return on evaluation tasks."""
 
     def __init__(self, world: World, env: Environment, network: NetworkConfig, num: int) -> None:
         agent = kind_of(network).load().agent
-        assert agent is not None  # as ``watched`` sees to
+        assert agent is not None  # ``watched`` makes sure of it
         self._tasks = evaluation_tasks(env, num, world.num_test_tasks)
         self._keys = jax.random.split(jax.random.key(EVAL_SEED), num)
 
@@ -251,7 +257,7 @@ class ReturnsByItself:
         self._returns = together(env, return_of, in_axes=(None, 0, 0))
 
     def __call__(self, params: Any) -> dict[str, float]:
-        """The numbers for some weights."""
+        """The metrics of some weights."""
         returns = self._returns(params, self._keys, self._tasks)
         return {"eval/initial_return": float(np.mean(returns))}
 
@@ -263,16 +269,16 @@ def watched(
     demonstrator: Demonstrator | None,
     num: int,
 ) -> Callable[[Any], dict[str, float]]:
-    """``(params) -> returns`` that a training watches on ``num`` tasks."""
+    """``(params) -> metrics``, the evaluation of a training on ``num`` tasks."""
     if isinstance(network, TransformerConfig) and kind_of(network).name == MULTI_GOAL:
         return ReturnsOnTheWay(world, env, network, demonstrator, num)
     return ReturnsByItself(world, env, network, num)
 
 
 class Run:
-    """A training under way: its data, its trainer and what measures it.
+    """A training in progress: its data, its trainer and its evaluation.
 
-    Whoever makes it holds the claim on its folder, where it notes the settings of a run that begins.
+    The caller must hold the claim on the run's folder, to which a new run writes its settings.
     """
 
     def __init__(self, config: PretrainConfig, go_on: str) -> None:
@@ -281,7 +287,7 @@ class Run:
         own = config.data.data_folder
         spec = env.spec if env is not None else spec_of(read_facts(own or Path()))
         self.init = init = initial_policy(config, spec)
-        world_side(spec, config.head, config.encoder)  # complains about a bad head or encoder
+        world_side(spec, config.head, config.encoder)  # raises for a bad head or encoder
         check_loggers(config)
         meta = provenance()
         dataset, place, sha256 = (
@@ -313,7 +319,7 @@ class Run:
             self.identities = runs.identities(config, sha256, init_sha256)
 
     def _note(self, meta: dict[str, Any], begun: bool) -> None:
-        """Note in the folder what the run is, after everything that could be wrong with the settings."""
+        """Write down in the folder what the run is; called after all settings have been checked."""
         config = self.config
         if not begun:
             runs.begin(config, meta)
@@ -322,11 +328,11 @@ class Run:
         if (trained := runs.prolonged(config)) is not None:
             runs.note_prolonged(config, trained)
             kept = runs.kept_policy(self.folder, trained)
-            text = _how_it_goes_on(config.train, trained)
+            text = _describe_continuation(config.train, trained)
             print(f"{text}; the policy so far is kept in {kept}", file=sys.stderr)
 
     def _watched(self, env: Environment | None) -> Callable[[Any], dict[str, float]]:
-        """What is measured in the world on the way; nothing where there is none."""
+        """The evaluation in the world during training; without a world it measures nothing."""
         if env is None:
             return lambda params: {}
         config, world = self.config, envs.find(self.config.env)
@@ -340,7 +346,7 @@ class Run:
 
     @property
     def origin(self) -> dict[str, str]:
-        """What the files of the run say of the weights that it started from."""
+        """The entry on the initial weights in the files of the run."""
         return {"init_sha256": self.init.sha256} if self.init else {}
 
     def initial_state(self) -> TrainState:
@@ -348,14 +354,14 @@ class Run:
         return self.trainer.init(self.init.params if self.init else None)
 
     def _validation_parts(self, held_out: Dataset, horizon: int) -> list[BatchPlan]:
-        """Draws of one padded length; the validation loss is of the same ones every time."""
+        """Batches of one padded length for the validation loss; the same ones every time."""
         plan = replace(
             self.config.train, batch_size=512, part_size=64, part_steps=1 << 30, bucket=horizon
         )
         return next(batch_stream(plan, held_out, self.truncate))
 
     def measure(self, state: TrainState) -> dict[str, float]:
-        """Losses on held-out trajectories and returns.
+        """The losses on held-out trajectories, and the returns of the evaluation.
 
         Raises:
           DataError: if one of them is not finite.
@@ -371,7 +377,7 @@ class Run:
         return found
 
     def batches(self, first_step: int) -> Iterator[list[BatchPlan]]:
-        """The batches of the run from a step on."""
+        """The batches of the run, starting at ``first_step``."""
         return batch_stream(
             self.config.train,
             self.fit,
@@ -382,14 +388,14 @@ class Run:
 
 
 def train(config: PretrainConfig, go_on: str = "continue with --resume") -> None:
-    """Run or continue a training to its end and write the policy.
+    """Run or continue a training to its end, and write the policy.
 
     Args:
       config: settings of the run.
-      go_on: what continues it after a stop, for messages.
+      go_on: how to continue after an interruption, for messages.
 
     Raises:
-      Stopped: if it was asked to stop; the state is saved.
+      Stopped: if it was asked to stop; the state is saved first.
       DataError: if a loss, weight or return is not finite; the last sound checkpoint is kept.
     """
     folder = config.folder
@@ -408,7 +414,7 @@ def train(config: PretrainConfig, go_on: str = "continue with --resume") -> None
 
 
 def _has_ended(config: PretrainConfig) -> bool:
-    """Whether a run needs no more steps; its folder is made ready for them otherwise."""
+    """Whether a run needs no more steps; otherwise prepares its folder for them."""
     folder = config.folder
     remove_unfinished(folder)
     if runs.has_begun(folder):
@@ -418,7 +424,7 @@ def _has_ended(config: PretrainConfig) -> bool:
 
 
 def _train_and_save(run: Run, go_on: str) -> None:
-    """The steps of a training, and everything that is written."""
+    """Take the steps of a training, and write checkpoints, metrics, the policy and its curve."""
     config, folder = run.config, run.folder
     with checkpoints(folder / runs.CHECKPOINTS) as manager:
         blank = run.initial_state()
@@ -443,16 +449,16 @@ def _train_and_save(run: Run, go_on: str) -> None:
 
 
 def _train_along(run: Run, go_on: str) -> None:
-    """The steps of a training in a process that is not the first: the same ones, and nothing is written."""
+    """Take the steps of a training in a process other than 0, which writes nothing."""
     state = state_of_first(None, run.initial_state())
     with asked_to_stop() as stopping:
         _take_steps(run, Snapshot(state, [], []), None, None, stopping, go_on)
 
 
-def _how_it_goes_on(config: TrainConfig, trained: int) -> str:
-    """What a finished run does that takes more steps, in words.
+def _describe_continuation(config: TrainConfig, trained: int) -> str:
+    """A message on how a finished run continues with more steps.
 
-    Its learning rate is that of a run of the new length from the start, so that it usually rises.
+    Its learning rate follows the schedule of a run of the new length, so it usually rises at first.
     """
     rate = float(learning_rate_schedule(config)(trained))
     falls = "falls along the same cosine" if config.schedule == "cosine" else "stays there"
@@ -470,24 +476,24 @@ def _take_steps(
     stopping: Callable[[], int],
     go_on: str,
 ) -> TrainState:
-    """All gradient steps that are left, with checkpoints and evaluations on the way.
+    """Take the remaining gradient steps, with checkpoints and evaluations in between.
 
-    Without ``metrics`` and ``manager`` nothing is measured or saved: process 0 does it.
+    Without ``metrics`` and ``manager`` nothing is measured or saved; process 0 does that.
     """
     config, num_steps, state = run.config, run.config.train.steps, before.state
     batches = run.batches(state.step)
-    # Means are taken in float32, also of what comes from a checkpoint.
+    # Means are taken in float32, also over values from a checkpoint.
     pending = [{k: np.float32(v) for k, v in row.items()} for row in before.pending]
-    newest: list[tuple[int, dict[str, Array]]] = []  # the step whose figures are not looked at yet
+    newest: list[tuple[int, dict[str, Array]]] = []  # the last step, whose metrics are not read yet
     clock, since = time.process_time(), state.step
     with Progress(num_steps, "step", initial=state.step) as progress:
         while state.step < num_steps:
-            asked = (stopping(),) if processes.count() > 1 else ()  # told to the others
+            asked = (stopping(),) if processes.count() > 1 else ()  # passed on to the others
             state, row = run.trainer.step(state, next(batches), *asked)
             known, newest = newest, [(state.step, row)]
-            pending += [finite_metrics(*step) for step in known]  # computed by now: no waiting
+            pending += [finite_metrics(*step) for step in known]  # already computed: no waiting
             progress.update()
-            number, done = _agreed(stopping(), known), state.step == num_steps
+            number, done = _stop_signal(stopping(), known), state.step == num_steps
             saves = number or done or state.step % config.save_every == 0
             measures = done or state.step % config.eval_every == 0
             if saves or measures:
@@ -495,11 +501,11 @@ def _take_steps(
                 newest = []
             if measures:
                 spent = processes.total(time.process_time() - clock) / (state.step - since)
-                _check_together(state)
+                _check_same_weights(state)
                 if metrics is not None:
                     means = {**_means(pending), **run.measure(state)}
                     metrics.write(state.step, {**means, "cpu_seconds_per_step": spent})
-                    progress.show(_shown(means))
+                    progress.show(_progress_fields(means))
                 pending, clock, since = [], time.process_time(), state.step
             if saves and metrics is not None:
                 left = [{k: float(v) for k, v in row.items()} for row in pending]
@@ -511,11 +517,11 @@ def _take_steps(
     return state
 
 
-def _agreed(number: int, newest: Sequence[tuple[int, dict[str, Array]]]) -> int:
+def _stop_signal(number: int, newest: Sequence[tuple[int, dict[str, Array]]]) -> int:
     """The number of the signal that stops the training after this step, or 0.
 
-    A process by itself stops at once. Of several processes, each tells with its gradient whether it is
-    asked to stop; all read this one step later, when it is known, and stop after the same step.
+    A single process stops at once. Several processes exchange with their gradients whether any of them is
+    asked to stop. All read this one step later, when it is computed, and stop after the same step.
     """
     if processes.count() == 1:
         return number
@@ -523,10 +529,10 @@ def _agreed(number: int, newest: Sequence[tuple[int, dict[str, Array]]]) -> int:
     return (number or signal.SIGTERM) if asked else 0
 
 
-def _check_together(state: TrainState) -> None:
-    """Raise ``DisagreementError`` if processes that train together have drifted apart.
+def _check_same_weights(state: TrainState) -> None:
+    """Raise ``DisagreementError`` if the weights of the processes have drifted apart.
 
-    Processors of different kinds run different programs, whose last bits differ.
+    Different kinds of processors run different programs, whose results differ in the last bits.
     """
     if processes.count() > 1:
         processes.check_agreed({f"the hash of the weights at step {state.step}": hash_state(state)})
@@ -536,8 +542,8 @@ def _means(rows: list[dict[str, Any]]) -> dict[str, float]:
     return {f"train/{name}": float(np.mean([row[name] for row in rows])) for name in rows[0]}
 
 
-def _shown(row: dict[str, float]) -> dict[str, str]:
-    """What the progress shows of a row of metrics."""
+def _progress_fields(row: dict[str, float]) -> dict[str, str]:
+    """The metrics of a row that the progress line shows."""
     returns = {
         name.removeprefix("eval/").removesuffix("_return"): f"{value:.2f}"
         for name, value in row.items()

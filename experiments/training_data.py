@@ -1,4 +1,4 @@
-"""The dataset of a training: a user's own, or demonstrations, collected where they are missing."""
+"""The dataset of a training: a user's own, or demonstrations that are collected if they are missing."""
 
 from __future__ import annotations
 
@@ -24,14 +24,17 @@ from mgpo_jax.tasks import benchmark_tasks, task_hashes
 
 
 def own_dataset(config: PretrainConfig, env: Environment | None) -> tuple[Dataset, Path, str]:
-    """A dataset that a user brought, its folder and its hash; no test task of the world is in it.
+    """Load a user's own dataset.
 
     Args:
-      config: of the training.
-      env: the world that it must fit, if any.
+      config: settings of the training.
+      env: the world that the dataset must fit, if any.
+
+    Returns:
+      The dataset, its folder and its hash.
 
     Raises:
-      DataError: if the dataset there is damaged, does not fit or holds a test task.
+      DataError: if the dataset is damaged, does not fit the world or contains a test task.
     """
     folder = config.data.data_folder
     assert folder is not None
@@ -50,7 +53,7 @@ def own_dataset(config: PretrainConfig, env: Environment | None) -> tuple[Datase
 
 
 def refuse_test_tasks(dataset: Dataset, env: Environment, world: World, folder: Path) -> None:
-    """Raise ``DataError`` if a trajectory is of a task that is kept for test."""
+    """Raise ``DataError`` if a trajectory is of a test task."""
     forbidden = task_hashes(env, benchmark_tasks(env, world.num_test_tasks))
     if dataset.task_hashes is not None and np.isin(dataset.task_hashes, forbidden).any():
         raise DataError(f"{folder} holds a test task; remove it and collect it again")
@@ -59,14 +62,22 @@ def refuse_test_tasks(dataset: Dataset, env: Environment, world: World, folder: 
 def prepare_dataset(
     config: PretrainConfig, world: World, env: Environment, go_on: str
 ) -> tuple[Dataset, Path, str]:
-    """The dataset of a training, its folder and its hash; no test task is in it.
+    """Load the dataset of a training, and collect it first if it does not exist.
 
-    It is collected first where it is not there yet. Where another process collects it, that one is waited
-    for. ``go_on`` says what continues the command after a stop.
+    If another process is collecting it, this one waits.
+
+    Args:
+      config: settings of the training.
+      world: the world's record.
+      env: its environment.
+      go_on: how to continue after an interruption, for messages.
+
+    Returns:
+      The dataset, its folder and its hash.
 
     Raises:
-      DataError: if the dataset there is damaged, out of date or holds a test task.
-      UsageError: if nothing of it would be left to train on.
+      DataError: if the dataset is damaged, out of date or contains a test task.
+      UsageError: if the holdout leaves nothing to train on.
     """
     name, demonstrator = find_demonstrator(world, env, config.data.demonstrator)
     wanted = CollectConfig(
@@ -81,10 +92,10 @@ def prepare_dataset(
     if not processes.from_first(folder.exists):
         text = f"no dataset in {folder} yet: {wanted.trajectories} trajectories are collected first"
         print(text, file=sys.stderr)
-        # Another command may have collected it meanwhile, which processes that collect together do not see.
+        # A single process may find that another command has just collected it; that is fine, too.
         with suppress(*[ExistsError] * (processes.count() == 1)):
             collect_and_save(replace(wanted, resume=True), True, go_on)
-        processes.exchange(b"")  # from here on it is there for all
+        processes.exchange(b"")  # wait until every process can see it
     made = {
         "env": config.env,
         "policy": name,

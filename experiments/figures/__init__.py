@@ -1,4 +1,4 @@
-"""The figures of every world, as functions of results and of whoever plays episodes."""
+"""The figures, as functions of results and of a function that runs episodes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures of every world: curves of adaptation (figures 6 and 7 of the paper), profiles, and training."""
+"""Curves: returns during adaptation (the paper's Figures 6 and 7), performance profiles, and trainings."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 def learning_curve(results: Mapping[str, Results], title: str | None = None) -> Figure:
     """Figures 6 and 7: return of the optimized prompt over the episodes of adaptation.
 
-    Lines are means over tasks and seeds, bands the standard deviation over seeds. The line of the optimum
-    is drawn where the optimum is known.
+    Lines are means over tasks and seeds, bands the standard deviation over seeds. The optimum is drawn if
+    it is known.
     """
     figure = Figure(figsize=(4.8, 2.7), layout="constrained")
     _draw_curves(figure.add_subplot(), results, title)
@@ -31,7 +31,7 @@ def learning_curve(results: Mapping[str, Results], title: str | None = None) -> 
 
 @styled
 def learning_curves(results: Mapping[str, Mapping[str, Results]]) -> Figure:
-    """Figures 6 and 7 whole: a panel of learning curves for each world, with one legend."""
+    """Figures 6 and 7 as a whole: a panel of learning curves for each world, with one legend."""
     figure = Figure(figsize=(2.5 * len(results), 2.6), layout="constrained")
     panels = figure.subplots(1, len(results), squeeze=False)[0]
     for ax, (world, of_world) in zip(panels, results.items(), strict=True):
@@ -73,15 +73,15 @@ def _draw_curves(ax: Any, results: Mapping[str, Results], title: str | None) -> 
 
 @styled
 def performance_profiles(results: Mapping[str, Results], title: str | None = None) -> Figure:
-    """The share of tasks and seeds in which the optimized prompt is at least so good, for every "so good".
+    """Performance profiles (Agarwal et al., 2021): the share of tasks and seeds that reach each score.
 
-    A performance profile (Agarwal et al., 2021): where one line is above another everywhere, its method is
-    the better one whatever mean is taken. Where optima are known the scale is the regret, which can be
-    compared between tasks, from bad to good; elsewhere it is the return. Bands are intervals of 95 %.
+    If one line is above another everywhere, its method is better by any aggregate. If the optima are known,
+    the score is the regret, which is comparable between tasks, from bad to good; otherwise it is the
+    return. Bands are 95 % intervals.
     """
     figure = Figure(figsize=(4.8, 2.7), layout="constrained")
     ax = figure.add_subplot()
-    # A regret, negated: like a return it is the better the higher it is.
+    # The negated regret: like a return, higher is better.
     optima = [np.asarray(result.optimal_returns) for result in results.values()]
     known = all(np.isfinite(optimum).all() for optimum in optima)
     scores = [
@@ -110,9 +110,9 @@ def performance_profiles(results: Mapping[str, Results], title: str | None = Non
 
 @styled
 def training_curve(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Losses of a training run and its returns on the way, from the rows of ``metrics.jsonl``.
+    """Losses and returns during a training, from the rows of ``metrics.jsonl``.
 
-    The returns are of greedy or of sampled episodes, as the world judges policies.
+    The returns are of greedy or sampled episodes, whichever the world's record says.
     """
     steps = [row["step"] for row in rows]
     figure = Figure(figsize=(6.4, 2.4), layout="constrained")
@@ -127,7 +127,7 @@ def training_curve(rows: Sequence[Mapping[str, Any]]) -> Figure:
         ),
     )
     colors = (METHODS["bpe"].color, METHODS["ucb"].color)
-    # A training on data of no world has no returns.
+    # A training on a dataset without a world has no returns.
     drawn = [panel for panel in panels if any(name in row for name in panel[1] for row in rows)]
     axes = figure.subplots(1, max(1, len(drawn)), squeeze=False)[0]
     for ax, (ylabel, names) in zip(axes, drawn, strict=False):

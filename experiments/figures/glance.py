@@ -1,4 +1,4 @@
-"""Figure 11: the worlds at a glance, a panel for each, drawn as each world draws itself."""
+"""Figure 11: the worlds at a glance, with a panel for each that the world itself draws."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ from envs.base import Episode, Task
 from envs.drawing import Pictures, Shown
 from experiments.figures.style import plain, styled
 
-COLUMNS = 3  # at most
-SIDE = 2.45  # inches of a panel across
-WORDS_ROOM = 0.7  # inches that title and words take, above and below a picture
-WORDS_SIZE = 6.5  # points of the words below
-LETTERS_IN_INCH = 17  # of these words
-LONGEST = 240  # letters of them
+COLUMNS = 3  # maximum number of panels in a row
+SIDE = 2.45  # width and height of a picture, in inches
+WORDS_ROOM = 0.7  # height of the title and the description of a panel together, in inches
+WORDS_SIZE = 6.5  # font size of the description, in points
+LETTERS_IN_INCH = 17  # characters of the description per inch
+LONGEST = 240  # maximum number of characters in the description
 
 
 class Glance(NamedTuple):
-    """A world in one panel."""
+    """The panel of a world."""
 
     title: str
     words: str
-    """What it is, in a sentence; written below its picture."""
+    """A one-sentence description, written below the picture."""
     draw: Callable[[Axes], None]
+    """Draws the picture."""
 
 
 def look_of(
@@ -38,20 +39,23 @@ def look_of(
     start: Callable[[], np.ndarray],
     play: Callable[[], Episode],
 ) -> Callable[[Axes], None] | None:
-    """What draws a world on axes, from what it offers; None if it draws nothing that stands still.
+    """Choose how to draw a world on axes: a frame, a task, or an episode, whichever it offers first.
 
     Args:
-      pictures: what the world draws.
-      task: a task of it, with numpy leaves.
+      pictures: the pictures that the world offers.
+      task: a task of the world, with numpy leaves.
       goal: the task goal, ``[G]``.
-      start: gives the first observation of an episode.
-      play: plays an episode on the task. This and ``start`` are only called where a picture needs them.
+      start: returns the first observation of an episode; only called if a frame is drawn.
+      play: runs an episode on the task; only called if an episode is drawn.
+
+    Returns:
+      A function that draws on axes, or None if the world offers no still picture.
     """
     prompts, episodes = pictures.prompts, pictures.episodes
     if pictures.frame is not None:
         frame = np.asarray(pictures.frame(start()))
         return lambda ax: _draw_frame(ax, frame)
-    if prompts is not None:  # of no method: the world alone
+    if prompts is not None:  # with no prompts at all, it draws the task alone
         return lambda ax: prompts([ax], [task], [{}])
     if episodes is not None:
         episode = play()
@@ -61,7 +65,7 @@ def look_of(
 
 
 def reached_goals(episode: Episode) -> np.ndarray:
-    """The goals ``[k, G]`` that an episode reached, in their order."""
+    """The goals ``[k, G]`` that an episode reached, in order."""
     trajectory = episode.trajectory
     length = int(trajectory.length)
     reached = np.asarray(trajectory.goal_reached)[:length]
@@ -76,9 +80,9 @@ def _draw_frame(ax: Axes, frame: np.ndarray) -> None:
 
 @styled
 def at_a_glance(worlds: Sequence[Glance]) -> Figure:
-    """Figure 11: each world with its name above and what it is below, in rows of at most three.
+    """Figure 11: a panel for each world, with its name above and its description below.
 
-    A world's legend is left out: it belongs to figures that ask for it.
+    Legends that worlds draw are removed: they explain details that do not matter here.
     """
     rows = -(-len(worlds) // COLUMNS)
     columns = -(-len(worlds) // rows)

@@ -1,8 +1,8 @@
-"""Figures of prompts and of episodes under them, for every world that draws.
+"""Figures of prompts and of episodes under them, for any world that offers ``Pictures``.
 
-The numbers are those of the paper's figures: 2 prompts, 3 and 10 how prompt and behavior evolve, 5 that
-the order of a prompt decides, 9 short and long prompts. A world draws what it offers in its ``Pictures``;
-figures that it does not offer are left out, and so are those of methods without prompts.
+They follow the paper's figures: prompts (2), how prompt and behavior evolve (3 and 10), why the order of a
+prompt matters (5), and short and long prompts (9). Figures that a world does not offer are left out, and so
+are methods without prompts.
 """
 
 from __future__ import annotations
@@ -30,25 +30,25 @@ if TYPE_CHECKING:
     from experiments.store.results import Results
 
 NUM_ROLLOUTS = 64
-NUM_DRAWS = 64  # of which the longest prompt is taken
+NUM_DRAWS = 64  # prompts drawn, of which the longest is taken
 STAGES = (1, 10, 20, 40, 100)  # episodes after which a search is drawn
-EARLY_STAGES = (1, 2, 4, 8, 16)  # episodes after which what was seen is drawn
-BAR_ROOM = 0.6  # inches of a color bar
-LEGEND_WIDTH = 5.0  # inches that a figure with a legend below it takes at least
-LABEL_ROOM = (0.9, 0.65)  # inches of the labels of rows, and of title and legend of a search
-FRAME_HEIGHT = 200  # pixels that small frames are enlarged to
+EARLY_STAGES = (1, 2, 4, 8, 16)  # episodes after which the known part of a world is drawn
+BAR_ROOM = 0.6  # width of a color bar, in inches
+LEGEND_WIDTH = 5.0  # minimum width of a figure with a legend below it, in inches
+LABEL_ROOM = (0.9, 0.65)  # inches: width of row labels, and height of title and legend, of a search
+FRAME_HEIGHT = 200  # height that small frames are enlarged to, in pixels
 
 Save = Callable[[Path], object]
 """Writes one picture to a path."""
 Play = Callable[[jax.Array, Task, np.ndarray, int, bool], Episode]
-"""``(key, task, goals [k, G], num, greedy) -> Episode`` with numpy leaves ``[num, ..]``: that many
-episodes on a task under a prompt."""
+"""``(key, task, goals [k, G], num, greedy) -> Episode``: runs ``num`` episodes on a task under a prompt;
+numpy leaves ``[num, ..]``."""
 
 
 def figures_of_run(
     pictures: Pictures, result: Results, which: Sequence[int]
 ) -> Iterator[tuple[str, Save]]:
-    """File name and writer of each figure that needs no policy, for some tasks of one adaptation."""
+    """The figures of one adaptation that need no policy: their file names and writers."""
     if _has_prompts(result):
         if pictures.prompts:
             yield "prompts.png", later(prompts, pictures, {result.method: result}, which)
@@ -57,7 +57,7 @@ def figures_of_run(
 
 
 def later(draw: Callable[..., Figure], *args: Any) -> Save:
-    """The writer of a figure that is only drawn when it is written."""
+    """A writer that draws its figure only when it is called."""
     return lambda path: draw(*args).savefig(path)
 
 
@@ -68,16 +68,16 @@ def figures_of_results(
     which: Sequence[int],
     seed: int,
 ) -> Iterator[tuple[str, Save]]:
-    """File name and writer of each figure of some adaptations to the same tasks.
+    """The figures of some adaptations to the same tasks: their file names and writers.
 
-    Nothing is drawn before its writer is called, but all players are there when the last name is known.
+    Figures are drawn when their writers are called; all policies are loaded once the iterator is exhausted.
 
     Args:
-      pictures: what the world draws.
+      pictures: the pictures that the world offers.
       results: adaptations by their labels in legends, "method" or "method (remark)".
-      play_with: who plays the episodes of an adaptation.
-      which: the tasks to draw. Figures of one task and of one method show the first.
-      seed: which seed of the adaptations to draw.
+      play_with: makes the function that runs episodes for an adaptation.
+      which: indices of the tasks to draw; figures of a single task show the first.
+      seed: index of the seed to draw.
     """
     results = {label: result for label, result in results.items() if _has_prompts(result)}
     if not results:
@@ -117,7 +117,7 @@ def figures_of_results(
 def prompts(
     pictures: Pictures, results: Mapping[str, Results], which: Sequence[int], seed: int = 0
 ) -> Figure:
-    """Figure 2: the final prompt of each method, in its color, on a few tasks."""
+    """Figure 2: the final prompt of each method on a few tasks, in the method's color."""
     looks = method_styles(results)
     tasks = _tasks_of(next(iter(results.values())), which)
     by_color = [
@@ -142,7 +142,7 @@ def search(
     seed: int = 0,
     stages: Sequence[int] = STAGES,
 ) -> Figure:
-    """For each task the best prompt after some episodes, as rows.
+    """The best prompt after some numbers of episodes, as rows, with a panel for each task.
 
     Only stages at which the prompt was evaluated are drawn, and the last evaluation.
     """
@@ -180,7 +180,7 @@ def evolution(
     key: jax.Array,
     stages: Sequence[int] = STAGES,
 ) -> Figure:
-    """Figures 3 and 10: the best prompt after some episodes, and where it leads the policy."""
+    """Figures 3 and 10: the best prompt after some numbers of episodes, and where it leads the policy."""
     shown = []
     for stage in stages:
         if stage <= result.returns.shape[2]:
@@ -202,7 +202,7 @@ def known(
     key: jax.Array,
     stages: Sequence[int] = EARLY_STAGES,
 ) -> Figure:
-    """What a search has seen after some episodes, the best prompt then, and a greedy episode under it."""
+    """What a search has seen after some numbers of episodes, and a greedy episode under the best prompt."""
     shown, reached = [], []
     for stage in stages:
         if stage <= result.returns.shape[2]:
@@ -221,9 +221,9 @@ def known(
 def short_and_long(
     pictures: Pictures, result: Results, play: Play, which: Sequence[int], key: jax.Array
 ) -> Figure:
-    """Figure 9: behavior under the task goal alone, and under the longest prompts.
+    """Figure 9: behavior under the task goal alone (top row), and under long prompts (bottom row).
 
-    Long prompts are drawn from the best of the trajectories above them.
+    A long prompt is drawn from the best of the trajectories in the panel above it.
     """
     above, below = [], []
     for index, keys in zip(which, jax.random.split(key, (len(which), 3)), strict=True):
@@ -247,7 +247,7 @@ def episodes(
     seed: int,
     key: jax.Array,
 ) -> Figure:
-    """A greedy episode on each task under its optimized prompt."""
+    """A greedy episode on each task, under its optimized prompt."""
     tasks, shown = _tasks_of(result, which), []
     for index, task in zip(which, tasks, strict=True):
         goals = _best_goals(result, seed, index)
@@ -271,7 +271,7 @@ def video(
 ) -> None:
     """Figure 5: a GIF of greedy episodes under the initial and the optimized prompt, side by side.
 
-    Where the world asks for it and there is one, another order of the optimized goals stands beside them.
+    If the world asks for it, a third episode shows the optimized goals in another order.
     """
     task, optimized = result.task(index), _best_goals(result, seed, index)
     named = {"Initial prompt": result.task_goals[index][None], "Optimized prompt": optimized}
@@ -290,10 +290,10 @@ def video(
 
 
 def in_another_order(goals: np.ndarray) -> np.ndarray | None:
-    """A prompt ``[k, G]`` with the goals before its final one reversed.
+    """A prompt ``[k, G]`` with all goals but the final one reversed.
 
-    Where that changes nothing, as in A B A, the first of them goes behind the others. None where all of
-    them are equal, or fewer than two: there is no other order then.
+    If reversing changes nothing, as in A B A, the goals are rotated by one instead. If there is no other
+    order, because all of them are equal or there are fewer than two, returns None.
     """
     before, final = goals[:-1], goals[-1:]
     for other in (before[::-1], np.roll(before, -1, axis=0)):
@@ -305,7 +305,7 @@ def in_another_order(goals: np.ndarray) -> np.ndarray | None:
 def longest_prompt(
     key: jax.Array, episodes: Episode, goal: np.ndarray, max_goals: int
 ) -> np.ndarray:
-    """The longest of some prompts ``[k, G]`` that are drawn from the best of a batch of episodes."""
+    """Draw prompts from the best of a batch of episodes; returns the longest of them, ``[k, G]``."""
     best = int(np.argmax(episodes.return_))
     reached = jax.tree.map(lambda leaf: jnp.asarray(leaf[best]), episodes.trajectory.goals)
     draw = jax.jit(draw_longest, static_argnames="num_slots")
@@ -319,9 +319,9 @@ def draw_longest(
     max_goals: int | Int[Array, ""],
     num_slots: int,
 ) -> Prompt:
-    """The longest of some prompts of at most ``max_goals`` goals that the one sampler draws.
+    """Draw prompts of at most ``max_goals`` goals; returns the longest of them.
 
-    Nearly always it has so many, if the trajectory reached enough of them.
+    It nearly always has ``max_goals`` goals, if the trajectory reached that many.
     """
     keys = jax.random.split(key, NUM_DRAWS)
     drawn = jax.vmap(lambda k: sample_prompt(k, reached, goal, num_slots, max_goals))(keys)
@@ -334,7 +334,7 @@ def _has_prompts(result: Results) -> bool:
 
 
 def _num_slots(result: Results) -> int:
-    """How many goals the longest prompt of an adaptation may have."""
+    """The maximum number of goals in a prompt of an adaptation."""
     return result.best["prompt.goals"].shape[-2]
 
 
@@ -345,7 +345,7 @@ def _best_goals(result: Results, seed: int, task: int, episodes: int | None = No
 
 
 def _file_names(results: Mapping[str, Results]) -> dict[str, Results]:
-    """Results by method, and number where one method ran more than once."""
+    """Results by file name: the method's name, with a number if it occurs more than once."""
     names: dict[str, Results] = {}
     for number, result in enumerate(results.values()):
         method = file_name(result.method)
@@ -364,7 +364,7 @@ def _play_once(play: Play, key: jax.Array, task: Task, goals: np.ndarray) -> Epi
 def _panels(
     pictures: Pictures, rows: int, columns: int, more: float = 0.0, at_least: float = 0.0
 ) -> tuple[Figure, list[Axes]]:
-    """A figure with a panel for each picture, and ``more`` inches at its right; ``at_least`` so wide."""
+    """A figure with a grid of panels, ``more`` extra inches of width, and a width of ``at_least``."""
     width, height = pictures.panel
     size = max(width * columns + more, at_least), height * rows
     figure = Figure(figsize=size, layout="compressed")
@@ -378,14 +378,14 @@ def _draw_visits(
     tasks: Sequence[Task],
     shown: Sequence[Shown],
 ) -> None:
-    """Where episodes went, below their titles and beside the scale of their colors."""
+    """Draw the visits of episodes, with titles and a color bar."""
     _finish(figure, axes, shown, pictures.visits(axes, tasks, shown), "visits in an episode")
 
 
 def _finish(
     figure: Figure, axes: Sequence[Axes], shown: Sequence[Shown], scale: Any, label: str
 ) -> None:
-    """Titles above pictures, and the scale of their colors beside them."""
+    """Add titles and a color bar."""
     for ax, each in zip(axes, shown, strict=True):
         ax.set_title(each.title)
     if scale is not None:
@@ -410,7 +410,7 @@ def _title(what: str, episodes: Episode) -> str:
 
 
 def _mean_return(episodes: Episode) -> str:
-    """Of one episode or several, for titles."""
+    """The mean return of one or more episodes, for titles."""
     return f"{np.mean(episodes.return_):.2f}".replace("-", "\N{MINUS SIGN}")
 
 

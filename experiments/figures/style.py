@@ -1,4 +1,4 @@
-"""What all figures share: how they look, and the colors of the methods."""
+"""The style that all figures share, and the colors of the methods."""
 
 from __future__ import annotations
 
@@ -40,19 +40,19 @@ STYLE: dict[Any, Any] = {
 
 
 class Look(NamedTuple):
-    """How a method looks in figures."""
+    """How a method is drawn in figures."""
 
     name: str
-    """In legends."""
+    """Its name in legends."""
     color: str
     line: str
     marker: str
 
 
 def title_of(method: str) -> str:
-    """What legends call a method, by its name or place; the name itself for one that is not known.
+    """The title of a method in legends; an unknown method's title is its name.
 
-    The name may come from a file: nothing is imported for it.
+    The name may come from a file, so nothing is imported for it.
     """
     try:
         return KNOWN_METHODS.known(method, "the results", "--method").title or method
@@ -61,7 +61,7 @@ def title_of(method: str) -> str:
 
 
 def plain(text: str, longest: int = 60) -> str:
-    """A text from a file as a picture shows it: on one line, not too long, and never as a formula."""
+    """Text from a file made safe for a picture: on one line, shortened, and never a formula."""
     return shortened(printable(text), longest).replace("$", r"\$")
 
 
@@ -99,7 +99,7 @@ Args = ParamSpec("Args")
 
 
 def styled(draw: Callable[Args, Figure]) -> Callable[Args, Figure]:
-    """Draw in ``STYLE`` without touching the settings of the process."""
+    """Make a function draw in ``STYLE`` without changing matplotlib's global settings."""
 
     @wraps(draw)
     def wrapper(*args: Args.args, **kwargs: Args.kwargs) -> Figure:
