@@ -20,11 +20,11 @@ from mgpo_jax.settings import flag
 
 
 def adapt_default(config: AdaptConfig, flags: Iterable[str] = ()) -> AdaptConfig:
-    """The defaults, with the hyper-parameters of the method that a config names in its world.
+    """The default settings, with the hyper-parameters of the config's method in its world.
 
     Args:
       config: settings without hyper-parameters.
-      flags: what else the command line gives.
+      flags: the other flags on the command line.
 
     Raises:
       UsageError: for a flag that belongs to another method, or a world or method that does not exist.
@@ -40,7 +40,7 @@ def adapt_default(config: AdaptConfig, flags: Iterable[str] = ()) -> AdaptConfig
 
 
 def main(config: AdaptConfig) -> None:
-    """Adapt to each task within a budget of episodes, and judge what was found."""
+    """Adapt to each task within a budget of episodes, and evaluate the result."""
     check_flags(config)
     if config.validation and config.tasks is not None:
         raise UsageError("--validation draws the tasks; leave out --tasks")
@@ -80,7 +80,7 @@ def main(config: AdaptConfig) -> None:
     elif processes.is_first():
         results = finished(folder, config, policy, tasks)
         print(f"{folder} is finished already", file=sys.stderr)
-    if results is None:  # process 0 has them
+    if results is None:  # only process 0 has them
         return
     say(json.dumps(results.summary, indent=2) if config.json else printed(results.summary))
     if config.figures:

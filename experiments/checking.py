@@ -1,6 +1,6 @@
-"""Optimized prompts in a world and in its official program: what the policy reaches in both.
+"""Compare what a policy reaches under optimized prompts in a world and in its official program.
 
-Two episodes agree when they reach the same goals in the same order.
+Two episodes agree if they reach the same goals in the same order.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from mgpo_jax.files import hash_file
 from mgpo_jax.progress import Progress
 from mgpo_jax.tasks import task_at
 
-SAME_RETURN = 1e-5  # returns that differ by less are sums of the same rewards
+SAME_RETURN = 1e-5  # returns that differ by less are equal up to rounding
 
 
 def officials_of(cases: Sequence[Case]) -> list[Official]:
     """The official programs of the worlds of some adaptations.
 
     Raises:
-      UsageError: if a world has none, or what it needs is not installed.
+      UsageError: if a world has none, or the program's dependencies are not installed.
     """
     return [find_official(case.env, envs.make(case.env)) for case in cases]
 
 
 def compare(cases: Sequence[Case], officials: Sequence[Official]) -> Iterator[dict[str, Any]]:
-    """A row for each optimized prompt of some adaptations; the episodes run one after the other."""
+    """Yield a row for each optimized prompt of some adaptations; episodes run one after the other."""
     sizes = [case.result.eval_returns.shape[:2] for case in cases]
     with Progress(sum(seeds * tasks for seeds, tasks in sizes), "prompt") as progress:
         for case, official, (seeds, tasks) in zip(cases, officials, sizes, strict=True):
@@ -43,11 +43,11 @@ def compare(cases: Sequence[Case], officials: Sequence[Official]) -> Iterator[di
 
 
 def _compare_prompt(case: Case, official: Official, seed: int, index: int) -> dict[str, Any]:
-    """What the policy reaches in both under the optimized prompt of one seed and task."""
+    """The row of one seed and task: an episode under its optimized prompt in each of both worlds."""
     result, task = case.result, task_at(case.tasks, index)
     goals = result.best_goals(seed, index)
-    assert goals is not None  # ``open_case`` has refused methods without prompts
-    # Both are acted in by the same stepwise policy, so that they differ in nothing but the world.
+    assert goals is not None  # ``open_case`` refuses methods without prompts
+    # The same stepwise policy acts in both, so that they only differ in the world.
     actor = Actor(case.policy, goals)
     own = play(actor, Own(envs.make(case.env), task, official.goal_name))
     theirs = play(actor, official.episode(task))
@@ -69,7 +69,7 @@ def _compare_prompt(case: Case, official: Official, seed: int, index: int) -> di
 
 
 def _entries(played: Played) -> dict[str, Any]:
-    """What came of an episode, as it stands in a file."""
+    """The outcome of an episode as JSON values."""
     return {
         "reached": list(played.reached),
         "steps": list(played.steps),
@@ -79,7 +79,7 @@ def _entries(played: Played) -> dict[str, Any]:
 
 
 def summaries(cases: Sequence[Case], rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Of each adaptation that has rows: how many prompts agree, and mean returns."""
+    """A summary of each adaptation that has rows: how many prompts agree, and mean returns."""
     by_folder = {str(case.folder): case for case in cases}
     found = []
     for folder, case in by_folder.items():
@@ -108,7 +108,7 @@ HEAD = (
 
 
 def cells(row: dict[str, Any]) -> list[str]:
-    """A row as it is printed; where both reached the same, it stands there once."""
+    """The cells of a row in the printed table."""
     here, there = row["here"], row["there"]
     return [
         row["folder"],

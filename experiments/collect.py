@@ -11,7 +11,7 @@ from experiments.store.settings import CollectConfig
 
 
 def main(config: CollectConfig) -> None:
-    """Collect demonstrations on random tasks, none of them a test task."""
+    """Collect demonstrations on random tasks, excluding the test tasks."""
     join(config)
     from experiments.datasets import collect_and_save
 

@@ -1,4 +1,4 @@
-"""Let a shell complete the words of ``mgpo``: ``eval "$(mgpo completion bash)"``."""
+"""Shell completion for ``mgpo``: ``eval "$(mgpo completion bash)"``."""
 
 from __future__ import annotations
 
@@ -45,16 +45,16 @@ def main(config: CompletionConfig) -> None:
 
 
 def script(shell: str) -> str:
-    """The script for a shell, as tyro writes it.
+    """The completion script for a shell, as tyro generates it.
 
-    The flags of hyper-parameters are those of the default method, since a script cannot know which method a
+    It has the hyper-parameters of the default method only, since a script cannot know which method a
     command line will name.
     """
     from experiments.__main__ import COMMANDS
     from experiments.store.data_settings import SUBCOMMANDS
 
-    settings = {name: _settings_of(name) for name in COMMANDS} | {"data": _one_of(SUBCOMMANDS)}
-    parsed: Any = tyro.conf.OmitArgPrefixes[_one_of(settings)]
+    settings = {name: _settings_of(name) for name in COMMANDS} | {"data": _union_of(SUBCOMMANDS)}
+    parsed: Any = tyro.conf.OmitArgPrefixes[_union_of(settings)]
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
         tyro.cli(
@@ -67,19 +67,19 @@ def script(shell: str) -> str:
 
 
 def _settings_of(name: str) -> Any:
-    """The class of the settings of a command."""
+    """The settings dataclass of a command."""
     module = importlib.import_module(f"experiments.{name}")
     return get_type_hints(module.main)["config"]
 
 
-def _one_of(settings: Mapping[str, Any]) -> Any:
-    """Commands by their names, as one type of which tyro makes subcommands."""
+def _union_of(settings: Mapping[str, Any]) -> Any:
+    """A union type that tyro parses as subcommands, from their settings dataclasses by name."""
     named = [Annotated[kind, tyro.conf.subcommand(name)] for name, kind in settings.items()]
     return Union[tuple(named)]  # noqa: UP007 (made at run time)
 
 
 def _with_known_names() -> ConstructorRegistry:
-    """A registry of tyro in which the names of worlds and methods are choices to complete."""
+    """Rules for tyro that make the names of worlds and methods choices, which scripts complete."""
     registry, under_way = ConstructorRegistry(), set[type]()
 
     @registry.struct_rule
@@ -91,13 +91,13 @@ def _with_known_names() -> ConstructorRegistry:
         under_way.discard(info.type)
         if not isinstance(spec, StructConstructorSpec):
             return None
-        return dataclasses.replace(spec, fields=tuple(map(_completed, spec.fields)))
+        return dataclasses.replace(spec, fields=tuple(map(_with_choices, spec.fields)))
 
     return registry
 
 
-def _completed(field: StructFieldSpec) -> StructFieldSpec:
-    """The field with the names that it takes, and with a help of one line, as scripts need it."""
+def _with_choices(field: StructFieldSpec) -> StructFieldSpec:
+    """The field with its known names as choices, and with its help text on one line, as scripts need it."""
     names: list[str] = {"env": envs.names, "method": methods.names}.get(field.name, list)()
     known: Any = Literal[tuple(names)]
     kind = field.type

@@ -56,7 +56,7 @@ def draw_run(world: World, results: Results, folder: Path) -> None:
 
 
 def is_kept(path: Path) -> bool:
-    """Whether to keep a file, since it was changed or not written by a command; if so, says so on stderr."""
+    """Whether a file must stay, since it was changed or not written by a command; reports it on stderr."""
     if not is_foreign(path):
         return False
     print(

@@ -24,24 +24,26 @@ class EvaluateConfig(Joined):
     runs: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Result folders of adaptations."""
     env: Name | None = None
-    """Evaluate in another world that has the same tasks (default: where the prompts were found)."""
+    """The world to evaluate in, which must have the same tasks (default: the one that the prompts were
+    found in)."""
     obs_noise: tuple[NotNegative | Literal["official"], ...] = ()
-    """Standard deviations of noise on observations, in their units, or ``official``: the noise that the
-    world's official program adds by default. A row for each."""
+    """Standard deviations of the noise on observations, in their units, or ``official`` for the noise that
+    the world's official program adds by default; a row for each."""
     action_noise: tuple[NotNegative, ...] = ()
-    """Standard deviations of noise on actions; where they are discrete, probabilities of a random one."""
+    """Standard deviations of the noise on continuous actions, or probabilities of a random action for
+    discrete ones; a row for each."""
     episodes: NumEpisodes = 10
-    """Episodes under each prompt, judged as the world's record says."""
+    """Number of episodes under each prompt, greedy or sampled as the world's record says."""
     seed: Seed = 0
-    """Seed of the noise."""
+    """Random seed of the episodes."""
     policy: Path | None = None
-    """Folder of the policy that the results were found with, where it is no longer at its place."""
+    """Folder of the policy that the results were made with, if it has been moved."""
     json: Path | None = None
-    """Also write the rows to this file."""
+    """JSON file to write the rows to."""
 
 
 def main(config: EvaluateConfig) -> None:
-    """Evaluate the optimized prompts of adaptations once more, under noise (Table 3) or elsewhere."""
+    """Evaluate optimized prompts of adaptations once more, under noise (Table 3) or in another world."""
     check_flags(config)
     require_runs(config.runs, "evaluate")
     if config.json:

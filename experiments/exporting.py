@@ -1,4 +1,4 @@
-"""Write a policy for other runtimes than jax, with all that is to be known of it."""
+"""Export a policy for runtimes other than jax, with metadata about it."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.policy_files import load_policy
 from mgpo_jax.transformer import OBS_LIMIT, TransformerConfig
 
-KEY = "mgpo_jax"  # of the facts in the metadata of a model
+KEY = "mgpo_jax"  # key of our facts in the metadata of a model
 INSTALL = 'pip install -e ".[onnx]"'
 
 
 def check_extra() -> None:
-    """Raise ``MissingExtraError`` if onnx is not installed; imports nothing of it."""
+    """Raise ``MissingExtraError`` if onnx is not installed, without importing it."""
     if importlib.util.find_spec("onnx") is None:
         raise MissingExtraError(f"an export needs the package onnx: {INSTALL}")
 
 
 def check_exportable(config: TransformerConfig, name: str) -> None:
-    """Raise ``UsageError`` for a network that there is no graph for."""
+    """Raise ``UsageError`` for a network that cannot be exported."""
     if config.head != "categorical" or config.encoder != "linear":
         raise UsageError(
             f"the policy of {name} has the head {config.head} and the encoder {config.encoder}; an export "
@@ -34,7 +34,7 @@ def check_exportable(config: TransformerConfig, name: str) -> None:
 
 
 def prefill_path(out: Path) -> Path:
-    """Where the model that reads the prompt lies, beside that of a step."""
+    """The file of the model that reads the prompt, beside that of the model of one step."""
     return out.with_name(f"{out.stem}_prefill{out.suffix}")
 
 
@@ -42,7 +42,7 @@ def export_onnx(world: World, policy_folder: Path | None, out: Path) -> None:
     """Write the released policy of a world, or the one in a folder, as two ONNX files.
 
     Raises:
-      UsageError: if there is no such policy, or no graph for its network.
+      UsageError: if there is no such policy, or its network cannot be exported.
       DataError: if the policy is damaged or does not fit the world.
       MissingExtraError: if onnx is not installed.
     """
@@ -58,7 +58,7 @@ def export_onnx(world: World, policy_folder: Path | None, out: Path) -> None:
 
 
 def facts_of(world: World, policy: LoadedPolicy) -> dict[str, Any]:
-    """What a program that runs the models has to know, as JSON values."""
+    """The facts that a program needs to run the models, as JSON values."""
     config, spec = policy.config, world.make().spec
     return {
         "world": world.name,
@@ -78,7 +78,7 @@ def facts_of(world: World, policy: LoadedPolicy) -> dict[str, Any]:
                 "embed_dim": config.embed_dim,
             }
         ),
-        # The models do this themselves.
+        # For information only: the models standardize observations themselves.
         "standardization": {
             "mean": list(config.obs_mean),
             "std": list(config.obs_std),

@@ -1,4 +1,4 @@
-"""Datasets as logs for others: flat arrays in an npz file, or a Minari dataset."""
+"""Export datasets for other programs: as flat arrays in an npz file, or as a Minari dataset."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ def export_dataset(folder: Path, out: Path, author: str = "") -> None:
     """Write a dataset as logs.
 
     Args:
-      folder: where the dataset lies.
+      folder: folder of the dataset.
       out: an npz file, or the folder of a Minari dataset.
-      author: who made it, for the metadata of a Minari dataset.
+      author: author in the metadata of a Minari dataset.
 
     Raises:
       DataError: if the dataset is damaged, or has no observations after its last actions.
@@ -41,7 +41,7 @@ def export_dataset(folder: Path, out: Path, author: str = "") -> None:
 
 
 def _sized(dataset: Dataset, facts: Facts) -> dict[str, np.ndarray]:
-    """What an import needs to know of all episodes beside their arrays."""
+    """The entries (``SIZED``) with which an import restores what the arrays do not say."""
     spec = facts.spec
     found: dict[str, Any] = {
         "horizon": [spec.horizon],
@@ -57,7 +57,7 @@ def _sized(dataset: Dataset, facts: Facts) -> dict[str, np.ndarray]:
 
 
 def _ends(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
-    """Whether each trajectory was terminated and truncated; where nobody knows it counts as truncated."""
+    """Whether each trajectory was terminated, and truncated; if unknown, it counts as truncated."""
     unknown = np.ones(len(dataset), bool)
     if dataset.terminated is None or dataset.truncated is None:
         return ~unknown, unknown
@@ -65,10 +65,10 @@ def _ends(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
 
 
 def flat_arrays(dataset: Dataset, facts: Facts) -> dict[str, np.ndarray]:
-    """All trajectories one after the other, as D4RL has them, with what else the dataset holds.
+    """All trajectories one after the other in D4RL's format, with the other arrays of the dataset.
 
-    ``observations`` and ``next_observations`` have a row for every action. Only the last row of each
-    trajectory of the latter says something new.
+    ``observations`` and ``next_observations`` have a row for every action, so the latter only add the last
+    observation of each trajectory.
     """
     last = np.cumsum(dataset.lengths) - 1
     after = np.concatenate([dataset.obs[1:], dataset.obs[:1]])
@@ -92,7 +92,7 @@ def flat_arrays(dataset: Dataset, facts: Facts) -> dict[str, np.ndarray]:
 
 
 def _spaces(facts: Facts) -> tuple[Any, Any]:
-    """The spaces of observations and of actions, as gymnasium has them."""
+    """The gymnasium spaces of observations and actions."""
     import gymnasium
 
     spaces: Any = gymnasium.spaces
@@ -109,7 +109,7 @@ def _spaces(facts: Facts) -> tuple[Any, Any]:
 
 
 def _write_minari(dataset: Dataset, facts: Facts, out: Path, author: str) -> None:
-    """A Minari dataset in a folder, written a trajectory at a time."""
+    """Write a Minari dataset, one trajectory at a time."""
     minari = import_extra("minari", "minari")
     from minari.data_collector import EpisodeBuffer
     from minari.dataset.minari_storage import MinariStorage
@@ -145,7 +145,7 @@ def _write_minari(dataset: Dataset, facts: Facts, out: Path, author: str) -> Non
         for name, array in _sized(dataset, facts).items()
     }
     with new_folder(out) as place:
-        # Pictures stay as they are: JPEG would change them.
+        # Lossless: JPEG would change image observations.
         storage = MinariStorage.new(place.absolute() / "data", seen, acted, jpeg_encoding=False)
         storage.update_metadata(
             {

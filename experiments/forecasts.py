@@ -1,4 +1,4 @@
-"""``--dry-run``: what a command would do, in numbers, without doing it."""
+"""``--dry-run``: estimates of the work and resources that a command would need."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from mgpo_jax.runner import log_bytes
 from mgpo_jax.tasks import num_tasks
 from mgpo_jax.training import initial_params
 
-OPTIMIZER = 3  # weights, their gradient and a moment, at least, in a gradient step
+OPTIMIZER = 3  # copies of the weights in a gradient step, at least: weights, gradient, a moment
 
 
 def of_adaptation(
@@ -35,7 +35,7 @@ def of_adaptation(
 ) -> str:
     """What ``adapt`` would do: searches, episodes, memory and CPU time.
 
-    The CPU time is that of published adaptations in this world (``inventory.seconds_per_episode``).
+    The CPU time is estimated from published adaptations in this world (``inventory.seconds_per_episode``).
     """
     num, method = num_tasks(tasks), methods.find(config.method)
     lanes = num * config.seeds * _num_variants(config)
@@ -48,7 +48,10 @@ def of_adaptation(
         ("steps", f"at most {lanes * (config.episodes + judged) * env.spec.horizon:,}"),
         ("network", f"{_num_weights(policy.params):,} weights"),
         ("memory", f"{log_bytes(env, lanes, config.episodes) / 1e6:,.0f} MB of results at most"),
-        ("CPU time", _told(None if rate is None else rate * lanes * (config.episodes + judged))),
+        (
+            "CPU time",
+            _cpu_time(None if rate is None else rate * lanes * (config.episodes + judged)),
+        ),
         ("results", str(config.folder)),
     ]
     return block(f"{config.env}, {config.method}: nothing is done yet", rows)
@@ -65,8 +68,9 @@ def _num_variants(config: AdaptConfig) -> int:
 def of_training(config: PretrainConfig) -> str:
     """What ``pretrain`` would do: the network, its batches, memory and CPU time.
 
-    The weights of the multi-goal Transformer are counted; those of other kinds follow from their data. The
-    CPU time is that of the released policy of this world (``inventory.price_of``).
+    Weights are only counted for the multi-goal Transformer, since the sizes of other kinds depend on the
+    data. The CPU time is estimated from the training of the world's released policy
+    (``inventory.price_of``).
     """
     train, folder = config.train, config.data.data_folder
     spec = spec_of(read_facts(folder)) if folder is not None else envs.make(config.env).spec
@@ -84,7 +88,7 @@ def of_training(config: PretrainConfig) -> str:
     rows += [
         ("batches", f"{train.batch_size} trajectories in parts of {train.part_size}"),
         ("steps", f"{train.steps:,}"),
-        ("CPU time", _told(None if folder is not None else price_of(config))),
+        ("CPU time", _cpu_time(None if folder is not None else price_of(config))),
         ("run", str(config.folder)),
     ]
     return block(f"{config.env}, {config.method}: nothing is done yet", rows)
@@ -95,7 +99,7 @@ def _num_weights(params: Any) -> int:
     return sum(math.prod(leaf.shape) for leaf in leaves)
 
 
-def _told(seconds: float | None) -> str:
+def _cpu_time(seconds: float | None) -> str:
     if seconds is None:
         return "not known: nothing like it was measured"
     if seconds < 120:

@@ -1,8 +1,8 @@
-"""Logs of others as a dataset: one episode is read, checked and written after the other.
+"""Import logs of other programs as a dataset: read, check and write one episode after the other.
 
-An episode of T actions has T + 1 observations. Of an episode with only T the last action is left out, since
-nobody knows what came of it. Goals are told by a function, or are columns or arrays of the logs; row t + 1
-is what was achieved by action t.
+An episode of T actions has T + 1 observations. If there are only T, the last action is dropped, since its
+effect is unknown. Achieved goals come from a function, or from columns or arrays of the logs; row t + 1 is
+what action t achieved.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ NEXT = ("next_observations", "next_observation", "next_obs")
 REWARDS = ("rewards", "reward")
 OWN_BY_STEP = ("achieved_goals", "goal_reached", "outcomes", "intended")
 OWN_BY_TRAJECTORY = ("task_hashes", "variants")
-"""Arrays that our own exports have, and that are taken as they are."""
+"""Arrays of our own exports, which are imported as they are."""
 DTYPES = {"achieved_goals": np.float32, "goal_reached": np.bool_, "outcomes": np.float32}
 LARGEST_INT = np.iinfo(np.int32)
 
@@ -41,11 +41,11 @@ Rows = dict[str, np.ndarray]
 
 
 class BadEpisodeError(DataError):
-    """One episode cannot be used, whatever the others are."""
+    """An episode that cannot be used; the others may be fine."""
 
 
 class Appender:
-    """Appends rows to an npy file, whose header is set right at the end."""
+    """Appends rows to an npy file; ``finish`` writes their number into the header."""
 
     def __init__(self, path: Path, row: np.ndarray) -> None:
         self.file = open(path, "wb")  # noqa: SIM115 (closed by finish)
@@ -54,7 +54,7 @@ class Appender:
         self.start = self.file.tell()
 
     def _write_header(self) -> None:
-        # The header of npy files leaves room for the first axis to grow.
+        # The header of an npy file has padding for the first axis to grow.
         header = {
             "descr": np.lib.format.dtype_to_descr(self.dtype),
             "fortran_order": False,
@@ -75,7 +75,7 @@ class Appender:
 
 
 class Writer:
-    """Writes the arrays of trajectories one after the other; all have the same names, shapes and dtypes."""
+    """Writes trajectories one after the other; all must have the same arrays, shapes and dtypes."""
 
     def __init__(self, place: Path) -> None:
         self.place, self.files = place, dict[str, Appender]()
@@ -110,10 +110,16 @@ class Writer:
 
 
 def named(name: str, arrays: Mapping[str, np.ndarray], who: str, flag: str) -> np.ndarray:
-    """The array of a name, or the only one whose name ends with it after a slash.
+    """The array with a name, or the only one whose name ends with a slash and that name.
+
+    Args:
+      name: the name.
+      arrays: the arrays of an episode.
+      who: what messages call the episode.
+      flag: the flag that gave the name, for messages.
 
     Raises:
-      UsageError: if there is none, or several; ``flag`` named it.
+      UsageError: if there is no such array, or more than one.
     """
     if name in arrays:
         return arrays[name]
@@ -126,10 +132,10 @@ def named(name: str, arrays: Mapping[str, np.ndarray], who: str, flag: str) -> n
 
 
 def load_function(place: str) -> Callable[..., Any]:
-    """The function at ``module:function``, also of a module in the current folder.
+    """Import a function given as ``module:function``; the module may be in the current folder.
 
     Raises:
-      UsageError: if there is none.
+      UsageError: if there is no such function.
     """
     module, _, attribute = place.partition(":")
     if (here := os.getcwd()) not in sys.path:
@@ -146,12 +152,12 @@ def load_function(place: str) -> Callable[..., Any]:
 def _wants_episode(function: Callable[..., Any]) -> bool:
     try:
         return next(iter(inspect.signature(function).parameters), "") == "episode"
-    except (TypeError, ValueError):  # functions of C have no signature
+    except (TypeError, ValueError):  # functions written in C have no signature
         return False
 
 
 def observations(config: ImportConfig, arrays: Mapping[str, np.ndarray], who: str) -> np.ndarray:
-    """The observations of an episode, [T + 1, ...] or [T, ...], in a dtype that a network takes."""
+    """The observations of an episode, [T + 1, ...] or [T, ...]; several arrays are concatenated."""
     if config.obs_arrays:
         parts = [named(name, arrays, who, "--obs-arrays") for name in config.obs_arrays]
     else:
@@ -170,7 +176,7 @@ def observations(config: ImportConfig, arrays: Mapping[str, np.ndarray], who: st
 
 
 def suited(array: np.ndarray, who: str, what: str) -> np.ndarray:
-    """An array with at most 32 bits a number, as programs take it."""
+    """The array with at most 32 bits per number, as our programs need it."""
     if array.dtype.kind == "f" and array.dtype.itemsize > 4:
         return array.astype(np.float32)
     if array.dtype.itemsize == 8:
@@ -181,10 +187,10 @@ def suited(array: np.ndarray, who: str, what: str) -> np.ndarray:
 
 
 class Converter:
-    """Episodes of some logs as the rows of a dataset.
+    """Converts the episodes of logs to the rows of a dataset.
 
     Args:
-      config: what the user wants.
+      config: settings of the import.
       source: the logs.
     """
 
@@ -192,13 +198,13 @@ class Converter:
         self.config, self.source = config, source
         self.function = load_function(config.goal) if config.goal else None
         self.num_cut = 0
-        """Episodes without an observation after their last action."""
+        """Number of episodes without an observation after their last action."""
 
     def rows(self, who: str, arrays: Mapping[str, np.ndarray]) -> Rows:
-        """One episode.
+        """The rows of one episode.
 
         Raises:
-          DataError: if it is not as it should be.
+          DataError: if the episode is invalid.
         """
         obs = observations(self.config, arrays, who)
         actions = first_of(ACTIONS, arrays)
@@ -227,7 +233,7 @@ class Converter:
         ends = {} if self._lacks("ends") else {"terminated": TERMINATED, "truncated": TRUNCATED}
         for name, names in ends.items():
             flag = first_of(names, arrays)
-            # An end that was left out did not happen.
+            # If the last step was dropped, so was the end of the episode.
             ended = flag is not None and not cut_off and bool(np.reshape(flag, -1)[-1])
             rows[name] = np.array([ended])
         for name in OWN_BY_TRAJECTORY:
@@ -237,11 +243,11 @@ class Converter:
         return rows
 
     def _lacks(self, what: str) -> bool:
-        """Whether one of our own exports says that its dataset had none of something."""
+        """Whether our own export notes that the original dataset had no such arrays."""
         return bool((sized_of(self.source, f"without_{what}") or [False])[0])
 
     def actions(self, actions: np.ndarray, who: str) -> np.ndarray:
-        """Actions as the network gives them: numbers from 0 on, or numbers in [-1, 1]."""
+        """Actions in the form that networks use: integers from 0, or numbers in [-1, 1]."""
         low, high = np.array(self.config.action_low), np.array(self.config.action_high)
         if actions.dtype.kind in "iu" and not len(low):
             if actions.ndim == 2 and actions.shape[1] == 1:
@@ -303,7 +309,7 @@ class Converter:
             changes = np.ones(num, bool)
             if config.reached == "changes":
                 changes = np.any(np.diff(goals, axis=0), axis=1)
-                # Without a goal before the first action it counts as reached by that.
+                # Without a goal before the first action, the first goal counts as reached.
                 changes = np.concatenate([np.ones(num - len(changes), bool), changes])
             found["goal_reached"] = changes
         found.setdefault("goal_reached", np.ones(num, bool))
@@ -315,8 +321,7 @@ class Converter:
     def _achieved(
         self, who: str, arrays: Mapping[str, np.ndarray], obs: np.ndarray, num: int
     ) -> np.ndarray:
-        """Achieved goals as a function, columns or an array tells them: [T + 1, G], or [T, G] "
-        "after actions."""
+        """Achieved goals from a function, columns or an array: [T + 1, G], or [T, G] after actions only."""
         config = self.config
         if config.goal_columns:
             flat = obs.reshape(len(obs), -1)
@@ -332,7 +337,7 @@ class Converter:
         else:
             assert self.function is not None
             what = f"--goal {config.goal}"
-            found = self._told(who, arrays, obs, what)
+            found = self._call_goal_function(who, arrays, obs, what)
         goals = np.asarray(found)
         if goals.ndim == 1:
             goals = goals[:, None]
@@ -345,7 +350,9 @@ class Converter:
             )
         return goals.astype(np.float32)
 
-    def _told(self, who: str, arrays: Mapping[str, np.ndarray], obs: np.ndarray, what: str) -> Any:
+    def _call_goal_function(
+        self, who: str, arrays: Mapping[str, np.ndarray], obs: np.ndarray, what: str
+    ) -> Any:
         assert self.function is not None
         whole = _wants_episode(self.function)
         given = SimpleNamespace(**{**arrays, "observations": obs}) if whole else obs
@@ -357,7 +364,7 @@ class Converter:
 
 
 def check_rows(who: str, rows: Rows, num: int) -> None:
-    """Raise for arrays with another number of rows than actions, and for NaN and infinity."""
+    """Raise ``BadEpisodeError`` for arrays with a wrong number of rows, and for NaN and infinity."""
     for name, array in rows.items():
         one = name in ("last_obs", "terminated", "truncated", *OWN_BY_TRAJECTORY)
         if len(array) != (1 if one else num):
@@ -369,11 +376,11 @@ def check_rows(who: str, rows: Rows, num: int) -> None:
 
 
 def import_dataset(config: ImportConfig) -> str:
-    """Make a dataset of logs; returns what there is to say of it.
+    """Convert logs to a dataset; returns a report for the user.
 
     Raises:
       UsageError: if the settings do not fit the logs.
-      DataError: if the logs are not as they should be.
+      DataError: if the logs are invalid.
     """
     assert config.out is not None
     skipped: list[str] = []
@@ -414,7 +421,7 @@ def import_dataset(config: ImportConfig) -> str:
 
 
 def sized_of(source: Source, name: str) -> Any:
-    """What our own exports say of all episodes; None where they say nothing."""
+    """An entry of our own exports that holds for all episodes; None if there is none."""
     return source.sized[name].reshape(-1).tolist() if name in source.sized else None
 
 
@@ -435,7 +442,7 @@ def _manifest(
     horizon: int | None,
     skipped: list[str],
 ) -> dict[str, Any]:
-    """What the manifest says beside hashes and counts."""
+    """The entries of the manifest, except for hashes and counts."""
     lengths = np.array(writer.lengths)
     discrete = writer.files["actions"].dtype.kind in "iu"
     size = 1 if discrete else writer.files["actions"].shape[0]
@@ -479,5 +486,5 @@ def _manifest(
 def _user() -> str:
     try:
         return getpass.getuser()
-    except (KeyError, OSError):  # a user without a name, as in some containers
+    except (KeyError, OSError):  # the user has no name, as in some containers
         return ""

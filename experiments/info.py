@@ -1,4 +1,4 @@
-"""Say what is installed on which machine: ``python -m experiments.info``."""
+"""Show what is installed, and on which machine: ``python -m experiments.info``."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class InfoConfig(Common):
     """Settings of ``experiments.info``."""
 
     json: bool = False
-    """Print JSON."""
+    """Print the report as JSON."""
 
 
 def gathered() -> dict[str, Any]:
@@ -48,7 +48,7 @@ def gathered() -> dict[str, Any]:
 
 
 def shown(found: dict[str, Any]) -> str:
-    """The same as lines of text."""
+    """What ``gathered`` found as lines of text."""
     rows = [
         *found["versions"].items(),
         ("revision", found["revision"]),
@@ -64,7 +64,7 @@ def shown(found: dict[str, Any]) -> str:
 
 
 def main(config: InfoConfig) -> None:
-    """Say versions, devices, memory, folders and extras: what a report of a fault should hold."""
+    """Show versions, devices, memory, folders and extras, for bug reports."""
     found = gathered()
     say(json.dumps(found, indent=2) if config.json else shown(found))
 

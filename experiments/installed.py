@@ -1,4 +1,4 @@
-"""What is installed on this machine: extras, released networks, caches. Nothing here imports jax."""
+"""What is installed: extras of this package, released networks, sizes of folders. Does not import jax."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mgpo_jax.released import released_folder
 DISTRIBUTION = "mgpo-jax"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 OF_EXTRA = re.compile(r"extra\s*==\s*['\"]([^'\"]+)['\"]")
-INDIRECT = ("all", "dev", "docs", "notebook")  # extras for developers, and those made of others
+INDIRECT = ("all", "dev", "docs", "notebook")  # extras for developers, or made of other extras
 
 
 class Extra(NamedTuple):
@@ -39,7 +39,7 @@ def how_to_install(extra: str) -> str:
 
 
 def extras() -> list[Extra]:
-    """The extras of this package that bring packages for users; none where it is not installed itself."""
+    """The extras of this package that are for users; empty if this package itself is not installed."""
     packages: dict[str, list[str]] = {}
     try:
         required = metadata.requires(DISTRIBUTION) or []
@@ -74,13 +74,13 @@ class Network(NamedTuple):
 
 
 def released_networks(world: World) -> list[Network]:
-    """The released networks of a world by their kinds, with the sizes of their weights."""
+    """The released networks of a world, by kind, with the sizes of their weights."""
     weights = {kind: released_folder(world, kind) / "weights.npz" for kind in KINDS.names()}
     return [Network(kind, path.stat().st_size) for kind, path in weights.items() if path.is_file()]
 
 
 def size_of(folder: Path) -> int:
-    """Bytes of all files below a folder; 0 where there is none."""
+    """Total bytes of all files below a folder; 0 if it does not exist."""
     return sum(_sizes(folder))
 
 

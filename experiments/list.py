@@ -20,11 +20,11 @@ class ListConfig(Common):
     """Settings of ``experiments.list``."""
 
     json: bool = False
-    """Print JSON."""
+    """Print the list as JSON."""
 
 
 def needs_of(record: Any) -> str:
-    """What a world, method or network needs, in a line; empty for nothing but what is always there."""
+    """What a world, method or network needs beyond this package, in one line; may be empty."""
     if isinstance(record, World):
         networks = ", ".join(map(str, released_networks(record))) or "none"
         return f"released networks: {networks}{_extra_of(record)}"
@@ -41,7 +41,7 @@ def _extra_of(world: World) -> str:
 
 
 def gathered() -> dict[str, Any]:
-    """Worlds, methods and networks with what each needs, as JSON values."""
+    """All worlds, methods and networks, and what each needs, as JSON values."""
     return {
         "worlds": [
             {
@@ -77,7 +77,7 @@ def main(config: ListConfig) -> None:
             try:
                 record = registry.find(name)
                 summary, needs = record.summary, needs_of(record)
-            except UsageError as error:  # of a package that is installed beside this one
+            except UsageError as error:  # a broken entry point of another package
                 summary, needs = str(error), ""
             say(f"  {name:<18} {summary}")
             if needs:

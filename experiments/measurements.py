@@ -1,4 +1,4 @@
-"""What the bench measures: collection, training, acting and adaptation, in CPU time."""
+"""The measurements of the bench: collection, training, acting and adaptation, in CPU time."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ NUM_BASELINE_TASKS = 4
 
 @dataclass(frozen=True)
 class Row:
-    """One measured figure."""
+    """One measurement."""
 
     name: str
     value: float
@@ -59,14 +59,15 @@ def measurements(
     quick: bool,
     rows: str = "all",
 ) -> Iterator[Row]:
-    """All rows of the bench for a world.
+    """Yield the rows of the bench for a world.
 
     Args:
-      env_name: the world.
-      demonstrator: whose demonstrations are collected (default: those of the recipe).
-      num_trajectories: how many.
-      quick: whether to do a tenth of the work.
-      rows: ``all``, ``shared`` (what several processes share) or ``step`` (up to the gradient step).
+      env_name: name of the world.
+      demonstrator: the demonstrator to collect with (default: that of the world's preset).
+      num_trajectories: number of trajectories to collect.
+      quick: whether to do about a tenth of the work.
+      rows: ``all``, ``shared`` (those whose work several processes share) or ``step`` (those up to the
+        gradient step).
     """
     world, env = envs.find(env_name), envs.make(env_name)
     note = "2048 x 2048, float32"
@@ -88,20 +89,20 @@ def measurements(
 
 
 def cpu_time(work: Callable[[], Any]) -> tuple[Any, float]:
-    """Result and CPU-seconds of ``work``, which is run to the end."""
+    """The result and the CPU-seconds of ``work``; waits until the result is computed."""
     start = time.process_time()
     result = jax.block_until_ready(work())
     return result, time.process_time() - start
 
 
 def shared_cpu_time(work: Callable[[], Any]) -> tuple[Any, float]:
-    """The same for work that several processes share: the CPU-seconds of all of them."""
+    """Like ``cpu_time``, with the CPU-seconds of all processes that share the work."""
     result, cpu = cpu_time(work)
     return result, processes.total(cpu)
 
 
 def matrix_product_rate(size: int = 2048, repeats: int = 4) -> float:
-    """GFLOP per CPU-second of a large float32 product."""
+    """GFLOP per CPU-second of a large float32 matrix product."""
     matrix = jnp.ones((size, size))
     product = jax.jit(lambda a: a @ a)
     jax.block_until_ready(product(matrix))
@@ -112,16 +113,16 @@ def matrix_product_rate(size: int = 2048, repeats: int = 4) -> float:
 def sequence_flops(
     config: TransformerConfig, num_goals: float, num_steps: np.ndarray
 ) -> np.ndarray:
-    """FLOP of one forward pass over real tokens, what is not read out left aside.
+    """FLOP of a forward pass over real tokens, without work whose result is not used.
 
-    Counted are the products of the layers as they stand: the last layer computes keys and values of
-    all tokens and the rest only where an action is read out, and attention its visible part.
+    This counts the matrix products: the last layer computes keys and values for all tokens, but the rest
+    only where an action is predicted, and attention counts for visible keys only.
     """
     width, steps = config.embed_dim, num_steps.astype(np.float64)
     each = config.tokens_per_step
     tokens = num_goals + each * steps - (each - 1)
     full_layer = 24 * width**2 * tokens + 2 * width * tokens * (tokens + 1)
-    # Keys visible from the observations: the prompt's, and those of the steps so far.
+    # Keys visible from the observations: those of the prompt and of the steps so far.
     visible = steps * num_goals + steps * (each * (steps - 1) / 2 + 1)
     last_layer = 4 * width**2 * tokens + 20 * width**2 * steps + 4 * width * visible
     obs_size = np.prod(config.obs_shape)
@@ -132,7 +133,7 @@ def sequence_flops(
 def bench_collect(
     world: World, env: Environment, name: str | None, num: int
 ) -> tuple[Dataset, Row]:
-    """Demonstrations of ``name``, or of the world's first demonstrator."""
+    """Measure collection with the demonstrator ``name``, or the world's first; returns the dataset, too."""
     name, demonstrator = find_demonstrator(world, env, name)
     collecting = partial(collect, env, demonstrator, num_test_tasks=world.num_test_tasks)
     collecting(num=1, seed=1)  # compiles
@@ -148,7 +149,7 @@ def bench_gradient_step(
     dataset: Dataset,
     num_steps: int,
 ) -> Iterator[Row]:
-    """Gradient steps over the recipe's own stream of batches."""
+    """Measure gradient steps on the batches of a real training."""
     mesh = device_mesh(devices_for(config.part_size))
     trainer = Trainer(config, network, dataset, mesh)
     num_devices = mesh.devices.size * processes.count()
@@ -180,7 +181,7 @@ def _step_rows(
     rate: float,
     note: str,
 ) -> Iterator[Row]:
-    """What some gradient steps cost, and how much of it was of use."""
+    """The rows on the cost of some gradient steps, and how much of it was useful work."""
     parts = [part for batch in batches for part in batch]
     lengths = np.concatenate([part.lengths for part in parts])
     padded = sum(len(part.lengths) * part.num_steps for part in parts)
@@ -194,7 +195,7 @@ def _step_rows(
     yield Row("  matrix product", rate, "GFLOP / CPU-s", "2048 x 2048, same run, before and after")
     yield Row("  share of it", 100 * flops / cpu / 1e9 / rate, "%")
     yield Row("  padding", 100 * (1 - lengths.sum() / padded), "%", "of the steps computed")
-    unit = 1e9 if platform.system() == "Darwin" else 1e6  # bytes there, kilobytes elsewhere
+    unit = 1e9 if platform.system() == "Darwin" else 1e6  # bytes on macOS, kilobytes elsewhere
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
     yield Row("  peak memory", peak, "GB", "of the whole process so far")
 
@@ -202,10 +203,13 @@ def _step_rows(
 def policy_to_bench(
     world: World, env: Environment, recipe: PretrainConfig, dataset: Dataset
 ) -> tuple[LoadedPolicy, str]:
-    """The released network of the kind that a recipe trains, or untrained weights where there is none.
+    """The released policy of the kind that a recipe trains, or an untrained one if there is none.
+
+    Returns:
+      The policy, and a note that says which of both it is.
 
     Raises:
-      UsageError: if the world has no such network.
+      UsageError: if the kind of network does not work in the world.
     """
     try:
         return load_policy(world, kind=recipe.method), "released policy"
@@ -216,7 +220,7 @@ def policy_to_bench(
 
 
 def bench_acting(env: Environment, policy: LoadedPolicy, note: str) -> Iterator[Row]:
-    """Time of one step of acting against the steps before it, and of a whole episode."""
+    """Measure the CPU time of one step of acting at several positions, and of a whole episode."""
     lanes = lanes_together(env, cache_bytes(policy.config))
     keys = jax.random.split(jax.random.key(0), lanes)
     tasks = jax.vmap(env.sample_task)(keys)
@@ -240,7 +244,7 @@ def bench_acting(env: Environment, policy: LoadedPolicy, note: str) -> Iterator[
 def _bench_decode(
     env: Environment, policy: LoadedPolicy, keys: PRNGKeyArray, tasks: Task, prompts: Prompt
 ) -> Iterator[Row]:
-    """Time of one step of acting, at an eighth, half and the end of the horizon."""
+    """Measure one step of acting at an eighth, at half and at the end of the horizon."""
     horizon, lanes, functions = env.spec.horizon, len(keys), policy.policy
     _, first = jax.vmap(env.reset)(keys, tasks)
     _, carry = jax.jit(jax.vmap(functions.prefill))(prompts, first.obs)
@@ -253,7 +257,7 @@ def _bench_decode(
         def decode(cache: Any, num_steps: int = num_steps) -> Any:
             def step(cache: Any, _: None) -> tuple[Any, Any]:
                 distribution, cache = jax.vmap(functions.decode)(cache, action, first.obs)
-                return cache, distribution  # what is not returned is not computed either
+                return cache, distribution  # XLA would drop what is not returned
 
             return jax.lax.scan(step, cache, length=num_steps)
 
@@ -264,7 +268,7 @@ def _bench_decode(
 
 
 class Endless(Wrapper):
-    """A world whose episodes last to the horizon."""
+    """A wrapper that makes every episode last until the horizon."""
 
     def reset(self, key: PRNGKeyArray, task: Task) -> tuple[State, TimeStep]:
         state, timestep = self.env.reset(key, task)
@@ -281,7 +285,7 @@ class Endless(Wrapper):
 def bench_adaptation(
     world: World, env: Environment, policy: LoadedPolicy, note: str, episodes: int
 ) -> Row:
-    """UCB on the world's test tasks."""
+    """Measure an adaptation with UCB to the world's test tasks."""
     num = world.num_test_tasks
     tasks = benchmark_tasks(env, num)
     outcome = adapt(env, policy, tasks, "ucb", seeds=3, episodes=episodes, judged=world.judged)
@@ -292,10 +296,10 @@ def bench_adaptation(
 def bench_baselines(
     world: World, env: Environment, env_name: str, dataset: Dataset, episodes: int
 ) -> Iterator[Row]:
-    """What an episode of each baseline costs: acting, and what it learns from it.
+    """Measure the cost of an episode of each baseline: acting, and learning from it.
 
-    The two episodes that judge each search are not divided by, a few percent of what was run. A baseline
-    that cannot be used in the world has no row.
+    The cost includes the two evaluation episodes of each search, a few percent, although only search
+    episodes are counted. A baseline that cannot be used in the world has no row.
     """
     tasks = benchmark_tasks(env, NUM_BASELINE_TASKS)
     for name in BASELINES:

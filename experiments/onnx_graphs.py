@@ -1,8 +1,8 @@
-"""A policy as two ONNX graphs: one reads the prompt, the other is one step with the key-value cache.
+"""A policy as two ONNX graphs: one reads the prompt, the other takes a step with the key-value cache.
 
-The graphs say what ``mgpo_jax.transformer`` computes, node by node, for a policy with the linear encoder
-and discrete actions. They are for one episode. Its cache grows: the tokens that were seen are the axis S of
-``keys``, ``values`` and ``mask``, from which the graph knows what the time is.
+The graphs compute what ``mgpo_jax.transformer`` does, for a policy with the linear encoder and discrete
+actions. They handle a single episode. The cache grows with every step: its ``keys``, ``values`` and
+``mask`` have an axis S of the tokens so far, whose length tells the graph the timestep.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from onnx import TensorProto, helper, numpy_helper
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.transformer import OBS_LIMIT, TransformerConfig
 
-OPSET, IR_VERSION = 17, 8  # the first with LayerNormalization; older runtimes read them
-EPSILON = 1e-6  # of a LayerNorm of flax
-HIDDEN = -1e9  # score of a key that is not visible
+OPSET, IR_VERSION = 17, 8  # the first with LayerNormalization; older runtimes support them
+EPSILON = 1e-6  # default of flax's LayerNorm
+HIDDEN = -1e9  # attention score of a key that is not visible
 
 
 class Graph:
-    """Nodes and weights as they are added."""
+    """An ONNX graph under construction: its nodes and weights."""
 
     def __init__(self, policy: LoadedPolicy) -> None:
         self.config: TransformerConfig = policy.config
@@ -33,24 +33,24 @@ class Graph:
         self.tensors: dict[str, Any] = {}
 
     def __call__(self, kind: str, *inputs: str, num: int = 1, **attributes: Any) -> Any:
-        """Add a node; returns the name of its output, or of all ``num`` of them."""
+        """Add a node; returns the name of its output, or the names of all ``num`` outputs."""
         outputs = [f"{kind.lower()}_{len(self.nodes)}_{i}" for i in range(num)]
         self.nodes.append(helper.make_node(kind, list(inputs), outputs, **attributes))
         return outputs[0] if num == 1 else outputs
 
     def named(self, kind: str, *inputs: str, to: str, **attributes: Any) -> None:
-        """Add a node whose output is one of the graph."""
+        """Add a node whose output is an output ``to`` of the graph."""
         self.nodes.append(helper.make_node(kind, list(inputs), [to], **attributes))
 
     def constant(self, array: Any, dtype: Any = np.int64) -> str:
-        """A constant; equal ones are stored once."""
+        """Add a constant, unless there is an equal one; returns its name."""
         array = np.asarray(array, dtype)
         name = f"constant_{array.dtype}_{list(array.shape)}_{array.ravel().tolist()}"
         self.tensors[name] = numpy_helper.from_array(array, name)
         return name
 
     def weight(self, name: str) -> str:
-        """An array of weights by its name in the policy."""
+        """Add an array of weights by its name in the policy; returns the name."""
         if name not in self.tensors:
             array = np.asarray(self.weights[name], np.float32)
             self.tensors[name] = numpy_helper.from_array(array, name)
@@ -101,14 +101,14 @@ def prefill_graph(policy: LoadedPolicy, facts: Mapping[str, str]) -> Any:
 
 
 def step_graph(policy: LoadedPolicy, facts: Mapping[str, str]) -> Any:
-    """The model of one step: the action before, the observation after it, and the cache.
+    """The model of one step, which reads the previous action and the observation after it.
 
     Inputs ``action``, ``obs`` and the cache ``past_keys``, ``past_values``, ``past_mask``; outputs
-    ``logits [A]``, ``next_action`` and the cache with the tokens of this step.
+    ``logits [A]``, ``next_action``, the greedy one, and the cache with the tokens of this step.
     """
     graph, config = Graph(policy), policy.config
     stride, slots = config.tokens_per_step, config.max_prompt_length
-    # The tokens of t steps, up to the last observation, are stride * t - (stride - 1).
+    # There are stride * t - (stride - 1) tokens of t steps, up to the last observation.
     seen = graph("Sub", graph("Shape", "past_mask"), graph.constant([slots - stride + 1]))
     time = graph("Div", seen, graph.constant([stride]))
     embedded = graph.dense(_one_hot(graph), "embed_action")
@@ -133,7 +133,14 @@ def step_graph(policy: LoadedPolicy, facts: Mapping[str, str]) -> Any:
 
 
 def _transform(graph: Graph, x: str, visible: str, past: tuple[str, str] | None) -> None:
-    """Run new tokens ``x [R, W]``, which see the keys in ``visible [R, S + R]``; makes all outputs."""
+    """Add the Transformer and all outputs of the graph.
+
+    Args:
+      graph: the graph.
+      x: new tokens ``[R, W]``.
+      visible: which keys they attend to, ``[R, S + R]``.
+      past: the inputs with the cached keys and values, if there is a cache.
+    """
     config, keys, values = graph.config, [], []
     size = config.embed_dim // config.num_heads
     heads = graph.constant([-1, config.num_heads, size])
@@ -175,7 +182,7 @@ def _transform(graph: Graph, x: str, visible: str, past: tuple[str, str] | None)
 
 
 def _obs_token(graph: Graph) -> str:
-    """The embedded observation ``[1, W]``, standardized first where the policy was trained so."""
+    """The embedded observation ``[1, W]``; standardized first, if the policy was trained that way."""
     config = graph.config
     flat = graph("Reshape", "obs", graph.constant([1, -1]))
     if config.obs_mean:
@@ -192,14 +199,14 @@ def _time(graph: Graph, time: str) -> str:
 
 
 def _one_hot(graph: Graph) -> str:
-    """The action that was taken as numbers ``[1, A]``."""
+    """The previous action as a one-hot row ``[1, A]``."""
     row = graph("Unsqueeze", "action", graph.constant([0]))
     sizes = graph.constant(graph.config.action_dim), graph.constant([0, 1], np.float32)
     return graph("OneHot", row, *sizes, axis=-1)
 
 
 def _joined(graph: Graph, first: list[int], rest: str) -> str:
-    """A shape of some sizes and those of another shape."""
+    """A shape that consists of the sizes ``first`` and those of the shape ``rest``."""
     return graph("Concat", graph.constant(first), rest, axis=0)
 
 

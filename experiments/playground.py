@@ -1,4 +1,4 @@
-"""Lead a policy by hand in one page: ``python -m experiments.playground --env maze15``."""
+"""Make a web page to guide a policy by hand: ``python -m experiments.playground --env maze15``."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ class PlaygroundConfig(Common):
     env: tuple[Name, ...] = (DEFAULT_WORLD,)
     """The worlds of the page, by name or as module:attribute."""
     policy: Path | None = None
-    """Folder of the policy that acts in it, for a page of one world (default: the released one)."""
+    """Folder of the policy that acts, for a page of one world (default: the world's released policy)."""
     out: Path = Path("playground.html")
-    """HTML file to write; it needs no other file, no server and no network."""
+    """HTML file to write; it is self-contained and needs no server or network."""
 
 
 def main(config: PlaygroundConfig) -> None:
-    """Make one HTML page in which anyone leads a frozen policy by goals."""
+    """Make an HTML page in which anyone guides a frozen policy by clicking goals."""
     if not config.env:
         raise UsageError("--env names no world; name at least one")
     if config.policy is not None and len(set(config.env)) > 1:

@@ -1,12 +1,12 @@
-"""Make a table of the paper with one command: ``python -m experiments.reproduce table1``.
+"""Reproduce a table or figure of the paper: ``python -m experiments.reproduce table1``.
 
-Tables 1, 2 and 8 compare methods in several worlds: cells that are missing are adapted, each by itself,
-and what cannot be had is a dash with the reason. Table 3 evaluates the same adaptations behind noise. An
-ablation is of one world, or of several one by one: it trains what is missing (a stopped run goes on where
-it was), adapts with UCB, prints the table and draws the learning curves; ``plan`` trains nothing and adapts
-with the own optimizer, less one of its parts. All trainings of an ablation have the same budget, shorter
-than that of the released policies and named above the table. ``all`` makes everything that is missing, and
-``list`` says what that is.
+Tables 1, 2 and 8 compare methods in several worlds: missing cells are adapted one by one, and a cell that
+is not available is a dash, with the reason below the table. Table 3 evaluates the same adaptations under
+noise. An ablation is made for one world at a time: it runs or continues the trainings that are missing,
+adapts with UCB, prints the table and draws the learning curves. All its trainings have the same budget,
+which is smaller than that of the released policies and is stated above the table. The ablation ``plan``
+trains nothing and adapts with our own optimizer, each time without one of its parts. ``all`` makes
+everything that is missing, and ``list`` shows what that is.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def main(config: ReproduceConfig) -> None:
 
 
 def make(config: ReproduceConfig) -> None:
-    """Make what a checked config asks for."""
+    """Make the table or figure of a config that was checked."""
     if config.what in ABLATIONS:
         for world in config.env or (config.world,):
             make_ablation(replace(config, env=(world,)))
@@ -66,7 +66,7 @@ def make(config: ReproduceConfig) -> None:
     elif config.what == GLANCE:
         from experiments import glance
 
-        glance.draw(config)  # which says what it has written
+        glance.draw(config)  # prints the file that it writes
     elif config.what in PICTURES:
         from experiments.comparisons import draw
 
@@ -76,7 +76,7 @@ def make(config: ReproduceConfig) -> None:
 
 
 def make_comparison(config: ReproduceConfig) -> None:
-    """Make a table of several methods and worlds."""
+    """Make a table of several methods in several worlds."""
     join(config)
     from experiments import comparisons, robustness
 
@@ -84,7 +84,7 @@ def make_comparison(config: ReproduceConfig) -> None:
     if not processes.is_first():
         return
     behind_noise = config.what == "table3"
-    with processes.apart():  # process 0 has all cells now, and makes the table by itself
+    with processes.apart():  # all cells are made now, and process 0 alone makes the table
         say(robustness.compare(config) if behind_noise else comparisons.compare(config))
     place = comparisons.files_of(config)[0]
     text = f"table in {place}" if behind_noise else f"table and curves in {place} and .png"
@@ -92,13 +92,13 @@ def make_comparison(config: ReproduceConfig) -> None:
 
 
 def make_all(config: ReproduceConfig) -> None:
-    """Make everything that is missing, one after the other.
+    """Make everything that is missing, one job after the other.
 
-    What cannot be made is said in one line, and the rest goes on. What a world does not have, such as a
-    table of demonstrators where there is one, is no failure.
+    A job that fails is reported in one line, and the others go on. A job that is not available in a world,
+    such as a table of demonstrators where there is only one, does not count as a failure.
 
     Raises:
-      DataError: at the end, if anything failed.
+      DataError: at the end, if any job failed.
     """
     from experiments.inventory import jobs
 

@@ -1,8 +1,8 @@
-"""Table 3: what optimized prompts are worth behind noise, row by row.
+"""Table 3: the returns of optimized prompts under noise, row by row.
 
-A row is one optimized set of prompts behind one noise, evaluated as ``experiments.evaluate`` does it, and
-lies in a file of its own. The adaptations are cells of the other comparisons. What was published under
-``results/`` is taken from there if it is of the same adaptation.
+A row is the optimized prompts of one adaptation under one noise, evaluated as ``experiments.evaluate``
+does, and is kept in its own file. The adaptations are the cells of the other comparisons. Published rows
+under ``results/`` are used if they belong to the same adaptation.
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ SIZES = (
     *(Noise(obs=size) for size in (OFFICIAL, 0.01, 0.03, 0.1)),
     *(Noise(action=size) for size in (0.02, 0.05, 0.1)),
 )
-"""The paper does not say how much noise it had."""
+"""The noises of the table; the paper does not say how much noise it added."""
 SMOKE_SIZES = (Noise(obs=0.01), Noise(action=0.05))
-EPISODES = 4  # under each prompt
-CLOSE = 1e-6  # returns of the same adaptation differ by less
+EPISODES = 4  # episodes under each prompt
+CLOSE = 1e-6  # final returns that differ by less belong to the same adaptation
 HEAD = (
     "world", "method", "noise", "paper (change)", "ours (mean ± std over seeds)", "change", "gap",
     "tasks x seeds x episodes", "CPU-minutes",
@@ -60,7 +60,7 @@ HEAD = (
 
 
 class Behind(BaseModel):
-    """What was measured behind one noise, as ``experiments.evaluate --json`` writes it, and more."""
+    """A measurement under one noise: a row of ``experiments.evaluate --json``, perhaps with its cost."""
 
     model_config = {**STRICT, "extra": "ignore"}
 
@@ -69,7 +69,7 @@ class Behind(BaseModel):
     num_tasks: Annotated[int, Ge(1)]
     num_seeds: Annotated[int, Ge(1)]
     episodes: Annotated[int, Ge(1)]
-    """Under each prompt."""
+    """Number of episodes under each prompt."""
     obs_noise: float | Literal["official"]
     action_noise: float
     adapted: float
@@ -78,17 +78,17 @@ class Behind(BaseModel):
     std_over_seeds: float | None
     change: float
     cpu_seconds: float | None = None
-    """With compilation; those of ``experiments.evaluate`` do not tell it."""
+    """CPU time with compilation; rows of ``experiments.evaluate`` do not have it."""
 
     def is_of(self, world: str, method: str, noise: Noise, summary: Summary) -> bool:
-        """Whether it is of an adaptation, by its numbers, behind this noise."""
+        """Whether this is the measurement of an adaptation under a noise, judged by their numbers."""
         same = (self.env, self.method, self.obs_noise, self.action_noise) == (world, method, *noise)
         size = (self.num_tasks, self.num_seeds) == (summary["num_tasks"], summary["num_seeds"])
         return same and size and abs(self.adapted - summary["final_return"]) < CLOSE
 
 
 class _Rows(BaseModel):
-    """A file of ``experiments.evaluate --json``."""
+    """A file that ``experiments.evaluate --json`` wrote."""
 
     model_config = {**STRICT, "extra": "ignore"}
 
@@ -96,15 +96,15 @@ class _Rows(BaseModel):
 
 
 class Row(NamedTuple):
-    """A line of the table."""
+    """A row of the table."""
 
     world: str
     method: str
     noise: Noise
     found: Behind | None
-    """None where it cannot be had."""
+    """The measurement; None if it is not available."""
     reason: str = ""
-    """Why it cannot be had."""
+    """Why it is not available."""
 
 
 def sizes_of(config: ReproduceConfig) -> Sequence[Noise]:
@@ -113,17 +113,17 @@ def sizes_of(config: ReproduceConfig) -> Sequence[Noise]:
 
 
 def place_of_row(config: ReproduceConfig, cell: Cell, noise: Noise) -> Path:
-    """The file of a row, in a folder beside that of the adaptations."""
+    """The file of a row, in a folder beside those of the adaptations."""
     name = f"{file_name(cell.method)}-{config.scale}-{num_seeds(config)}seeds"
     folder = config.out / file_name(cell.world) / "noise" / name
     return folder / f"{str(noise).replace(' ', '-')}.json"
 
 
 def known(config: ReproduceConfig, cell: Cell, noise: Noise) -> Behind | None:
-    """A row that is there already: made before, or published; None if there is none.
+    """An existing measurement, made before or published; None if there is none.
 
     Raises:
-      DataError: if a file is damaged, or the one made before is of another adaptation.
+      DataError: if its file is damaged, or is from another adaptation.
     """
     if cell.results is None:
         return None
@@ -145,13 +145,13 @@ def known(config: ReproduceConfig, cell: Cell, noise: Noise) -> Behind | None:
 
 
 def published_rows(world: str) -> tuple[Behind, ...]:
-    """The rows that were published for a world."""
+    """The published measurements of a world."""
     return _rows_in((PUBLISHED / file_name(world)).absolute())
 
 
 @cache
 def _rows_in(folder: Path) -> tuple[Behind, ...]:
-    """The rows in the files of a folder; one that is damaged is left out with a line on stderr."""
+    """The rows in the files of a folder; a damaged file is left out, with a line on stderr."""
     found: list[Behind] = []
     for path in sorted(folder.glob("noise*.json")):
         try:
@@ -162,7 +162,7 @@ def _rows_in(folder: Path) -> tuple[Behind, ...]:
 
 
 def rows_of(config: ReproduceConfig, world: str, method: str) -> Iterator[Row]:
-    """All rows of a method in a world; what is missing is measured."""
+    """All rows of a method in a world; missing ones are measured."""
     cell = made(config, world, method)
     sizes = sizes_of(config)
     if cell.results is None:
@@ -188,7 +188,7 @@ def rows_of(config: ReproduceConfig, world: str, method: str) -> Iterator[Row]:
 
 
 def num_episodes(config: ReproduceConfig) -> int:
-    """Episodes under each prompt."""
+    """The number of episodes under each prompt."""
     return 1 if config.scale == "smoke" else EPISODES
 
 
@@ -227,7 +227,7 @@ def _line(row: Row, notes: Notes) -> list[str]:
 
 
 def compare(config: ReproduceConfig) -> str:
-    """Measure all rows that are missing, and write the table; returns it."""
+    """Measure all missing rows, and write the table; returns it."""
     place = files_of(config)[0]
     check_replaceable([place])
     rows = [

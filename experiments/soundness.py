@@ -1,7 +1,8 @@
-"""What is wrong with a dataset, in sentences, and what is in it.
+"""Find faults in a dataset, and describe it.
 
-A fault is what a training should not learn from; a note is what may be meant so. Both name the trajectory
-and the step. What the heuristics are is said where they are: ``_misaligned`` and ``_wrong_ends``.
+A fault is something that a training should not learn from; a note is something that may be intended. Both
+are sentences that name the trajectory and the step. ``_misaligned`` and ``_wrong_ends`` explain their
+heuristics.
 """
 
 from __future__ import annotations
@@ -22,15 +23,15 @@ from mgpo_jax.archives import let_go
 from mgpo_jax.dataset import STEP_ARRAYS, Dataset, load_dataset
 from mgpo_jax.manifest import Facts, read_facts
 
-SAMPLE = 20_000  # steps that the regressions look at
-MOST_NUMBERS = 256  # of an observation, for the regressions
-RIDGE = 1e-3  # of the mean variance of the inputs
-MARGIN = 0.1  # of the variance that is left, by which another step's action has to explain more
+SAMPLE = 20_000  # maximum number of steps in a regression
+MOST_NUMBERS = 256  # maximum size of an observation or action in a regression
+RIDGE = 1e-3  # strength of the ridge penalty, relative to the variance of the inputs
+MARGIN = 0.1  # share of the variance that another row's action must explain beyond the own row's
 
 
 @dataclass
 class Findings:
-    """What was found, by kind: sentences, in the order in which they were found."""
+    """Sentences on faults and notes, by kind, in the order in which they were found."""
 
     faults: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
     notes: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
@@ -40,7 +41,7 @@ class Findings:
         return sum(map(len, self.faults.values()))
 
     def lines(self, most: int) -> Iterator[str]:
-        """What is printed: ``most`` of each kind, and how many more there are."""
+        """The lines to print: at most ``most`` of each kind, and how many more there are."""
         for word, kinds in (("fault", self.faults), ("note", self.notes)):
             for kind, found in kinds.items():
                 yield from (f"{word}: {text}" for text in found[:most])
@@ -51,25 +52,25 @@ class Findings:
 
 
 def examine(folder: Path, env: str | None = None, horizon: int | None = None) -> Findings:
-    """Look for everything that is known to go wrong in logs.
+    """Check a dataset for common faults of logs.
 
     Args:
-      folder: where the dataset lies.
-      env: the world whose shapes and horizon it must have.
-      horizon: steps after which an episode is cut off (default: the world's, or the manifest's).
+      folder: folder of the dataset.
+      env: the world whose shapes and horizon it must have, if any.
+      horizon: steps after which an episode is truncated (default: the world's, or the manifest's).
 
     Raises:
-      DataError: if it is no dataset, damaged, or of other shapes than the world's.
+      DataError: if it is not a dataset, is damaged, or does not have the world's shapes.
     """
     facts, spec = read_facts(folder), None
     if env is not None:
         spec = envs.make(env).spec
         horizon = horizon or spec.horizon
-    dataset, _ = load_dataset(folder, _any_length(spec), any_value=True)
+    dataset, _ = load_dataset(folder, _without_horizon(spec), any_value=True)
     found = Findings()
     _not_finite(dataset, found)
     if found.faults:
-        return found  # nothing else can be told of such numbers
+        return found  # the other checks need finite numbers
     _wrong_observations(dataset, found)
     _misaligned(dataset, facts, found)
     _wrong_ends(dataset, horizon or facts.spec.horizon, found)
@@ -78,19 +79,19 @@ def examine(folder: Path, env: str | None = None, horizon: int | None = None) ->
     return found
 
 
-def _any_length(spec: EnvSpec | None) -> EnvSpec | None:
-    """The world without its horizon: lengths over it are a finding, not the end of the search."""
+def _without_horizon(spec: EnvSpec | None) -> EnvSpec | None:
+    """The spec without its horizon, so that too long trajectories become findings instead of an error."""
     return None if spec is None else replace(spec, horizon=2**31 - 1)
 
 
 def _place(dataset: Dataset, row: int) -> str:
-    """Trajectory and step of a row of the arrays of all steps."""
+    """The trajectory and step that a row of the flat arrays belongs to, in words."""
     index = int(np.searchsorted(np.cumsum(dataset.lengths), row, side="right"))
     return f"trajectory {index}, step {row - int(dataset.starts[index])}"
 
 
 def _not_finite(dataset: Dataset, found: Findings) -> None:
-    """NaN, infinity, and actions out of range."""
+    """Find NaN, infinity, and actions out of range."""
     for name, array in dataset.arrays.items():
         if array.dtype.kind != "f":
             continue
@@ -114,7 +115,7 @@ def _not_finite(dataset: Dataset, found: Findings) -> None:
 
 
 def _pieces(array: np.ndarray, size: int = 1 << 24) -> Iterator[tuple[int, np.ndarray]]:
-    """An array piece by piece, of which little is in memory at a time, with the first row of each."""
+    """Yield an array in pieces, each with the index of its first row, to save memory."""
     rows = max(1, size // max(1, array[:1].nbytes))
     for first in range(0, len(array), rows):
         yield first, np.asarray(array[first : first + rows])
@@ -122,7 +123,7 @@ def _pieces(array: np.ndarray, size: int = 1 << 24) -> Iterator[tuple[int, np.nd
 
 
 def _wrong_observations(dataset: Dataset, found: Findings) -> None:
-    """Observations that belong to the episode before, and last observations that were not logged."""
+    """Find observations that belong to the previous episode, and missing last observations."""
     if dataset.last_obs is None:
         found.faults["last observation"].append(
             f"trajectory 0, step {dataset.lengths[0]}: there is no observation after the last "
@@ -135,7 +136,7 @@ def _wrong_observations(dataset: Dataset, found: Findings) -> None:
     final = dataset.obs[starts + dataset.lengths - 1].reshape(num, -1)
     last = np.asarray(dataset.last_obs).reshape(num, -1)
     same = [(first[lag:] == last[:-lag]).all(axis=1) for lag in range(1, min(5, num))]
-    # By chance a trajectory begins where another one ended, in worlds with few states.
+    # In worlds with few states, a trajectory may begin by chance where another one ended.
     chance = max((int(rows.sum()) for rows in same[1:]), default=0)
     few = dataset.obs.dtype.kind != "f" and same and same[0].mean() <= 0.2
     if same and same[0].sum() > 2 * chance and not few:
@@ -157,9 +158,8 @@ def _wrong_observations(dataset: Dataset, found: Findings) -> None:
         )
 
 
-def _explained(inputs: np.ndarray, targets: np.ndarray) -> float:
-    """Share of the variance of some rows that a ridge regression on the first half predicts in "
-    "the second."""
+def _explained_variance(inputs: np.ndarray, targets: np.ndarray) -> float:
+    """R^2 on the second half of the rows, of a ridge regression fitted to the first half."""
     half = len(inputs) // 2
     inputs = inputs - inputs[:half].mean(axis=0)
     inputs = inputs / np.where(inputs.std(axis=0) < 1e-8, 1, inputs.std(axis=0))
@@ -173,14 +173,14 @@ def _explained(inputs: np.ndarray, targets: np.ndarray) -> float:
 
 
 def _misaligned(dataset: Dataset, facts: Facts, found: Findings) -> None:
-    """Actions that belong to the step before or after, where it can be told.
+    """Find actions that belong to the step before or after theirs, where this can be told.
 
-    Ridge regressions predict the change of the observation from step t to t + 1, in its own spreads, from
-    the observations at t and t - 1 and the action in row t - 1, t or t + 1. It is a fault if the action of
-    another row explains at least ``MARGIN`` of the variance more than that of row t. An agent that only
-    reacts to what it sees gives rise to the same: its next action tells what it saw then. So where the
-    observation at t predicts half of the action in row t, the shift must show in the actions, too: the
-    observation that they would react to if they were shifted has to leave half as much unexplained.
+    Ridge regressions predict the standardized change of the observation from step t to t + 1, from the
+    observations at t and t - 1 and the action in row t - 1, t or t + 1. It is a fault if the action of
+    another row explains more of the variance than that of row t, by more than ``MARGIN``. A reactive agent
+    has the same effect: its next action reveals the next observation. So if the observation at t predicts
+    at least half of the action in row t, the shift must show in the actions, too: the observation that they
+    would react to if they were shifted must leave less than half as much unexplained.
     """
     if facts.obs_size > MOST_NUMBERS or facts.action_dim > MOST_NUMBERS:
         found.notes["alignment"].append(
@@ -204,14 +204,14 @@ def _misaligned(dataset: Dataset, facts: Facts, found: Findings) -> None:
         )
         return
     obs = {lag: _numbers(dataset.obs, inner + lag) for lag in (-1, 0, 1)}
-    actions = {lag: _acted(dataset, inner + lag, facts) for lag in (-1, 0, 1)}
+    actions = {lag: _action_numbers(dataset, inner + lag, facts) for lag in (-1, 0, 1)}
     change = obs[1] - obs[0]
     change = change / np.where(change.std(axis=0) < 1e-8, 1, change.std(axis=0))
     explained = {
-        lag: _explained(np.concatenate([obs[0], obs[-1], acted], axis=1), change)
+        lag: _explained_variance(np.concatenate([obs[0], obs[-1], acted], axis=1), change)
         for lag, acted in actions.items()
     }
-    reacts = {lag: _explained(seen, actions[0]) for lag, seen in obs.items()}
+    reacts = {lag: _explained_variance(seen, actions[0]) for lag, seen in obs.items()}
     for lag, where in ((-1, "step after"), (1, "step before")):
         better = explained[lag] - explained[0]
         shifted = reacts[0] < 0.5 or 1 - reacts[-lag] < 0.5 * (1 - reacts[0])
@@ -229,18 +229,19 @@ def _numbers(array: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return np.asarray(array[rows], np.float64).reshape(len(rows), -1)
 
 
-def _acted(dataset: Dataset, rows: np.ndarray, facts: Facts) -> np.ndarray:
-    """Actions as numbers, one-hot where they are discrete."""
+def _action_numbers(dataset: Dataset, rows: np.ndarray, facts: Facts) -> np.ndarray:
+    """Actions as rows of numbers; discrete ones are one-hot."""
     if facts.num_actions is None:
         return _numbers(dataset.actions, rows)
     return np.eye(facts.num_actions)[np.asarray(dataset.actions[rows])]
 
 
 def _wrong_ends(dataset: Dataset, horizon: int, found: Findings) -> None:
-    """Lengths over the horizon, and time limits that are logged as ends of the task.
+    """Find lengths above the horizon, and time limits that were logged as terminations.
 
-    Ends are suspicious if at least three trajectories were terminated at the very horizon, and nine of ten
-    that have its length were. Being cut off before the horizon is a note, if others were cut off at it.
+    Terminations exactly at the horizon are a fault if there are at least three, and they make up nine
+    tenths of the trajectories of that length. Truncations before the horizon are a note if others are at
+    the horizon.
     """
     lengths = dataset.lengths
     for index in np.flatnonzero(lengths > horizon).tolist():
@@ -269,7 +270,7 @@ def _wrong_ends(dataset: Dataset, horizon: int, found: Findings) -> None:
 
 
 def _duplicates(dataset: Dataset, found: Findings) -> None:
-    """Trajectories with the same observations and actions, which a demonstrator may mean to make."""
+    """Find trajectories with the same observations and actions; on the same task this is only a note."""
     seen: dict[bytes, int] = {}
     starts, hashes = dataset.starts, dataset.task_hashes
     for index, (start, length) in enumerate(zip(starts, dataset.lengths, strict=True)):
@@ -287,7 +288,7 @@ def _duplicates(dataset: Dataset, found: Findings) -> None:
 
 
 def _idle_goals(dataset: Dataset, found: Findings) -> None:
-    """Trajectories in which no goal is reached, or in which goals never change."""
+    """Find trajectories in which no goal is reached, or the achieved goal never changes."""
     starts = dataset.starts
     reached = np.logical_or.reduceat(dataset.goal_reached, starts)
     changes = np.zeros(len(dataset), bool)
@@ -299,17 +300,17 @@ def _idle_goals(dataset: Dataset, found: Findings) -> None:
         ("still goals", changes, "the achieved goal is the same at every step"),
     ):
         bad = np.flatnonzero(~good)
-        # A few may stand still; if most do, the goals are not what they should be.
+        # A few such trajectories may be intended; if they are the majority, the goals are wrong.
         place = found.faults if len(bad) > 0.5 * len(dataset) else found.notes
         for index in bad.tolist():
             place[kind].append(f"trajectory {index}, step 0: {text}")
 
 
 def described(folder: Path) -> str:
-    """What is in a dataset, for a person to read.
+    """A description of a dataset for a person to read.
 
     Raises:
-      DataError: if it is no dataset, or damaged.
+      DataError: if it is not a dataset, or is damaged.
     """
     facts = read_facts(folder)
     dataset, manifest = load_dataset(folder, any_value=True)
@@ -353,7 +354,7 @@ def _made_by(manifest: Mapping[str, Any]) -> str:
 
 
 def _spread(array: np.ndarray) -> str:
-    """Range, mean and standard deviation of all numbers of an array, a piece at a time."""
+    """The range, mean and standard deviation of all numbers in an array, in words."""
     low, high, total, squares, num = np.inf, -np.inf, 0.0, 0.0, 0
     for _, piece in _pieces(array):
         rows = piece.astype(np.float64)

@@ -1,7 +1,7 @@
-"""Where logs are read from: Minari, HDF5, npz, parquet. Every reader tells one episode after the other.
+"""Readers of logs: Minari, HDF5, npz, parquet. Each of them yields one episode after the other.
 
-An episode is a dictionary of arrays by name, a row for each action or for each observation. Names in groups
-are joined by slashes, such as ``observations/achieved_goal`` or ``infos/qpos``.
+An episode is a dictionary of arrays by name, with a row for each action or observation. Nested names are
+joined by slashes, such as ``observations/achieved_goal`` or ``infos/qpos``.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ SIZED = (
     "horizon", "num_actions", "action_low", "action_high", "cut_in_hindsight", "without_rewards",
     "without_ends",
 )  # fmt: skip
-"""Arrays of our own exports that say something of all episodes."""
+"""Arrays of our own exports that hold for all episodes."""
 OWN = "mgpo"
-"""The group among the infos of a Minari dataset that our own exports add, and how their metadata begin."""
+"""The group that our exports add to the infos of a Minari dataset, and the prefix of their metadata."""
 HDF5 = (".hdf5", ".h5", ".hdf")
 
 
 @dataclass
 class Source:
-    """Logs that are open.
+    """Opened logs.
 
     Attributes:
-      kind: what they are, for the manifest.
-      episodes: their episodes with what messages call them.
-      num: how many there are.
-      num_actions: number of discrete actions, where the source says it.
-      horizon: steps after which an episode is cut off, likewise.
-      sized: what our own flat files say of all episodes.
-      author: who made them, likewise.
+      kind: their format, for the manifest.
+      episodes: yields what messages call an episode, and its arrays.
+      num: number of episodes.
+      num_actions: number of discrete actions, if the source says so.
+      horizon: steps after which an episode is truncated, if the source says so.
+      sized: entries of our own exports that hold for all episodes (``SIZED``).
+      author: author of the logs, if the source says so.
     """
 
     kind: str
@@ -57,16 +57,19 @@ class Source:
 
 
 def first_of(names: Sequence[str], arrays: Mapping[str, Any]) -> Any:
-    """The first of several names that there is an array of; None if there is none."""
+    """The array with the first of several names that exists; None if none does."""
     return next((arrays[name] for name in names if name in arrays), None)
 
 
 @contextmanager
 def opened(source: str) -> Iterator[Source]:
-    """The logs at a place, as what they are.
+    """Open logs, whatever their format.
+
+    Args:
+      source: a file, a folder, or the id of a Minari dataset.
 
     Raises:
-      UsageError: if there are none, or what reads them is not installed.
+      UsageError: if there are no such logs, or the package that reads them is not installed.
       DataError: if they cannot be read.
     """
     path = Path(source)
@@ -91,10 +94,10 @@ def opened(source: str) -> Iterator[Source]:
 
 
 def import_extra(module: str, extra: str) -> Any:
-    """A module that one of the extras installs.
+    """Import a module that belongs to an extra of this package.
 
     Raises:
-      UsageError: if it is not installed, with the command that does.
+      UsageError: if it is not installed, with the command that installs it.
     """
     try:
         return importlib.import_module(module)
@@ -103,7 +106,7 @@ def import_extra(module: str, extra: str) -> Any:
 
 
 def _minari_by_id(source: str) -> Any:
-    """A Minari dataset that lies where Minari keeps them, by its id."""
+    """A local Minari dataset by its id."""
     if os.sep in source and source.startswith((".", os.sep)):
         raise UsageError(f"there is no file or folder {source}; give the place of your logs")
     try:
@@ -121,11 +124,11 @@ def _minari_by_id(source: str) -> Any:
 
 
 def _minari(dataset: Any) -> Source:
-    """A Minari dataset, an episode at a time."""
+    """A Minari dataset, read one episode at a time."""
     space, env = dataset.action_space, None
     try:
         env = dataset.env_spec
-    except Exception:  # a dataset without a world, in versions that complain about that
+    except Exception:  # some versions of Minari raise for datasets without an environment
         env = None
     num = int(space.n) if type(space).__name__ == "Discrete" else None
     first = int(space.start) if num is not None else 0
@@ -159,7 +162,7 @@ def _minari(dataset: Any) -> Source:
 
 
 def _leaves(value: Any, name: str) -> Iterator[tuple[str, np.ndarray]]:
-    """The arrays of numbers in nested dictionaries, by their names joined with slashes."""
+    """The numeric arrays in nested dictionaries, by their names joined with slashes."""
     if isinstance(value, Mapping):
         for key, part in value.items():
             yield from _leaves(part, f"{name}/{key}")
@@ -171,7 +174,7 @@ def _leaves(value: Any, name: str) -> Iterator[tuple[str, np.ndarray]]:
 
 @contextmanager
 def _hdf5(path: Path) -> Iterator[dict[str, Any]]:
-    """The arrays of an HDF5 file, which are read a slice at a time."""
+    """The arrays of an HDF5 file, which are read slice by slice."""
     h5py = import_extra("h5py", "minari")
     try:
         file = h5py.File(path, "r")
@@ -191,7 +194,7 @@ def _hdf5(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def _npz(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of numbers in an npz file."""
+    """The numeric arrays in an npz file."""
     headers = array_headers(path)
     names = [name for name, header in headers.items() if header.dtype.kind in "biuf"]
     return read_arrays(
@@ -200,7 +203,7 @@ def _npz(path: Path) -> dict[str, np.ndarray]:
 
 
 def _flat(kind: str, arrays: Mapping[str, Any], path: Path) -> Source:
-    """Episodes one after the other in flat arrays."""
+    """Episodes that are stored one after the other in flat arrays."""
     actions = first_of(ACTIONS, arrays)
     if actions is None:
         raise DataError(f"{path} lacks actions; it has {', '.join(sorted(arrays)) or 'no arrays'}")
@@ -226,7 +229,7 @@ def _flat(kind: str, arrays: Mapping[str, Any], path: Path) -> Source:
 
 
 def _ends(arrays: Mapping[str, Any], num_steps: int, path: Path) -> np.ndarray:
-    """Where the episodes of flat arrays end: the number of steps up to the last one of each."""
+    """Where the episodes in flat arrays end: the number of steps up to the end of each."""
     lengths = first_of(LENGTHS, arrays)
     if lengths is not None:
         ends = np.cumsum(np.asarray(lengths), dtype=np.int64)
@@ -256,12 +259,12 @@ def _ends(arrays: Mapping[str, Any], num_steps: int, path: Path) -> np.ndarray:
                     f"{len(rows)}"
                 )
             over |= rows.astype(bool)
-    over[-1:] = True  # whatever comes after the last end is an episode that was not finished
+    over[-1:] = True  # steps after the last end are an unfinished episode
     return 1 + np.flatnonzero(over)
 
 
 def _files(path: Path) -> list[Path]:
-    """The files of a folder with one for each episode, in the order of their names."""
+    """The files of a folder with one file per episode, sorted by name."""
     files = sorted(file for file in path.iterdir() if file.suffix in (".npz", ".parquet"))
     if not files:
         raise UsageError(
@@ -278,10 +281,10 @@ def _folder(files: Sequence[Path]) -> Iterator[tuple[str, dict[str, np.ndarray]]
 
 
 def _parquet(path: Path) -> dict[str, np.ndarray]:
-    """The columns of a parquet file. A column of lists becomes an array with one axis more.
+    """The columns of a parquet file as arrays; a column of lists becomes an array with another axis.
 
-    The last row may hold only what there is after the last action: a column that is null there is a row
-    shorter.
+    The last row may be for the observation after the last action only: columns that are null there are
+    shorter by one row.
     """
     parquet = import_extra("pyarrow.parquet", "parquet")
     try:

@@ -20,11 +20,11 @@ class TableConfig(Common):
     runs: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Result folders of adaptations."""
     json: bool = False
-    """Print JSON: a list of summaries, each with its folder, tasks and settings."""
+    """Print JSON instead: a list of summaries, each with its folder, tasks and settings."""
 
 
 def main(config: TableConfig) -> None:
-    """Print a Markdown table of adaptations, where it is fair beside the paper's Table 2."""
+    """Print a Markdown table of adaptations, with the paper's numbers where the comparison is fair."""
     require_runs(config.runs, "table")
     from experiments.store.rows import as_json, comparison, read_row
 

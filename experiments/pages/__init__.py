@@ -1,5 +1,6 @@
 """Self-contained HTML pages: the report of adaptations, and the playground of policies.
 
-``build`` joins JavaScript modules, style and data into one file, ``packing`` puts arrays into it,
-``report`` and ``playground`` say what is in each page. What a world brings is its ``envs.page.Page``.
+``build`` joins JavaScript modules, style and data into one file, and ``packing`` encodes arrays for it.
+``report`` and ``playground`` prepare the data of each page. What a world contributes is its
+``envs.page.Page``.
 """

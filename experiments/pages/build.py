@@ -1,10 +1,10 @@
-"""One HTML file of JavaScript modules, a style sheet and data, which opens without a server or a network.
+"""Bundle JavaScript modules, a style sheet and data into one HTML file that needs no server or network.
 
-Modules are joined as they are, but for the comments that hold their types (JSDoc). Each becomes a
-function whose result are its exports, so that no two of them share a name. Of the module syntax there is
-``import { a, b } from "./x.js"`` on one line, and ``export`` before ``const``, ``function`` and
-``class``. The page's Content-Security-Policy allows its own script and style by their hashes, and
-pictures within the file. Data enters as JSON that no parser of HTML can mistake for markup.
+Modules are joined unchanged, except that comments with types (JSDoc) are removed. Each becomes a function
+that returns its exports, so that their names cannot clash. Two forms of module syntax are supported:
+``import { a, b } from "./x.js"`` on one line, and ``export`` before ``const``, ``function`` and ``class``.
+The page's Content-Security-Policy allows its own script and style by their hashes, and pictures within the
+file. Data is embedded as JSON that an HTML parser cannot mistake for markup.
 """
 
 from __future__ import annotations
@@ -25,17 +25,24 @@ OTHER_SYNTAX = re.compile(r"^(?:import|export)\b.*$", re.M)
 
 
 class Bundle:
-    """Modules in an order in which each stands behind those that it imports."""
+    """Modules, ordered so that each comes after those that it imports."""
 
     def __init__(self) -> None:
         self._names: dict[Path, str] = {}
         self._parts: list[str] = []
 
     def add(self, path: Path, above: tuple[Path, ...] = ()) -> str:
-        """Add a module with those that it imports; returns the name of what it exports.
+        """Add a module and those that it imports.
+
+        Args:
+          path: the module.
+          above: the modules that import it.
+
+        Returns:
+          The name of the variable that holds its exports.
 
         Raises:
-          ValueError: if modules import each other in a circle, or one has other module syntax.
+          ValueError: if imports are circular, or a module has unsupported module syntax.
         """
         path = path.resolve()
         if path in above:
@@ -65,10 +72,10 @@ class Bundle:
 
 
 def script_of(entry: Path, worlds: Sequence[Path | None]) -> str:
-    """The script of a page: the modules of an entry and of some worlds, and the call that begins.
+    """The script of a page: its modules, those of some worlds, and the call that starts it.
 
     Args:
-      entry: the module of the page, which exports ``main(worlds, data)``.
+      entry: the main module of the page, which exports ``main(worlds, data)``.
       worlds: the modules of the worlds; None for a world without one.
     """
     bundle = Bundle()
@@ -79,15 +86,15 @@ def script_of(entry: Path, worlds: Sequence[Path | None]) -> str:
 
 
 def html(body: str, script: str, data: Mapping[str, Any]) -> str:
-    """A whole page.
+    """A complete HTML page.
 
     Args:
-      body: the markup of the page, from this package and never from a file of a user.
-      script: what runs in it.
-      data: JSON values; texts in it may come from anywhere.
+      body: the markup of the page, from this package and never from a user's file.
+      script: the script of the page.
+      data: JSON values, whose texts may come from anywhere.
 
     Raises:
-      ValueError: if the script would end its own element, as the module of a world might.
+      ValueError: if the script contains text that would end its own element.
     """
     if "</script" in script.lower() or "<!--" in script:
         raise ValueError("a script of a page must not hold </script or <!--; write '<\\/script'")
@@ -108,7 +115,7 @@ def html(body: str, script: str, data: Mapping[str, Any]) -> str:
 
 
 def as_text(data: Any) -> str:
-    """JSON without a character that could end the element it stands in; ``ValueError`` for NaN."""
+    """JSON without characters that could end the enclosing HTML element; raises ``ValueError`` for NaN."""
     text = json.dumps(data, allow_nan=False, ensure_ascii=True, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 

@@ -1,7 +1,7 @@
 """What a search knew after each episode, recomputed by telling its optimizer the recorded episodes again.
 
-Methods that keep a table of arms (``mgpo_jax.optimizers.arms``) decide about it by returns alone, so that
-no episode has to be played for it.
+Methods that keep a table of arms (``mgpo_jax.optimizers.arms``) update it by returns alone, so no episode
+has to be replayed.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from mgpo_jax.prompts import Prompt
 from mgpo_jax.rollout import Query
 from mgpo_jax.transformer import network_config
 
-NO_ARM = 255  # an episode that changed none; a table has at most 64 rows
+NO_ARM = 255  # stands for an episode that changed no arm; a table has at most 64 rows
 
 
 class Knowledge(NamedTuple):
-    """The row of the table of arms that each episode changed, and what stood in it then."""
+    """The row of the table of arms that each episode changed, and its new content."""
 
     row: np.ndarray
-    """``[S, N, E]`` uint8; ``NO_ARM`` where none changed."""
+    """``[S, N, E]`` uint8 index of the row; ``NO_ARM`` if none changed."""
     pulls: np.ndarray
-    """``[S, N, E]``: episodes of this arm so far; 1 for a new arm, which has the prompt of this episode."""
+    """``[S, N, E]`` pulls of this arm so far; 1 for a new arm, which has the prompt of this episode."""
     mean: np.ndarray
-    """``[S, N, E]`` float32: mean return of this arm so far."""
+    """``[S, N, E]`` float32 mean return of this arm so far."""
 
 
 def knowledge_of(results: Results) -> Knowledge | None:
     """What a search knew after each episode, or None for a method without a table of arms.
 
     Raises:
-      DataError: if the method, as it is now, does not come to the prompts on record.
+      DataError: if the present version of the method does not arrive at the recorded prompts.
     """
     found = told_adapter(results)
     if found is None or not isinstance(getattr(found[1], "arms", None), Arms):
@@ -57,7 +57,7 @@ def knowledge_of(results: Results) -> Knowledge | None:
     ) -> Any:
         def told(state: Any, row: Any) -> Any:
             goals, mask, greedy, return_ = row
-            key = jax.random.key(0)  # draws new prompts, of which the record has the real ones
+            key = jax.random.key(0)  # the prompts drawn with it are replaced by the recorded ones
             _, asked = adapter.ask(key, state)
             query = Query(Prompt(goals, mask), greedy)
             episodes = jax.tree.map(
@@ -80,7 +80,7 @@ def knowledge_of(results: Results) -> Knowledge | None:
 
 
 def disagreement(results: Results) -> DataError:
-    """What to say where a method, told the recorded episodes, does not come to the recorded prompts."""
+    """The error for a method that, told the recorded episodes, does not arrive at the recorded prompts."""
     return DataError(
         f"{results.method}, told the recorded episodes, acts with other prompts than those on record: "
         "they were made by another version"
@@ -88,10 +88,13 @@ def disagreement(results: Results) -> DataError:
 
 
 def told_adapter(results: Results) -> tuple[Adapter, Any] | None:
-    """The method of some results with their settings, and the shapes of its state.
+    """Make the adapter of some results from their settings, to tell it the recorded episodes.
 
-    It can be told episodes, but nobody can act, since it has no weights. None for a method without
-    prompts, or one that is not of today.
+    It has no weights, so it cannot act.
+
+    Returns:
+      The adapter and the shapes of its state; None for a method without prompts, with several episodes per
+      round, or that cannot be made from these settings.
     """
     config = results.config
     slots = results.choices["prompt.mask"].shape[-1] if "prompt.mask" in results.choices else 0
@@ -109,15 +112,15 @@ def told_adapter(results: Results) -> tuple[Adapter, Any] | None:
             judged=results.world.judged,
         )
         method.check_use(setting, hyper)
-        adapter = method.adapter(setting, None, hyper)  # no weights: nobody acts
+        adapter = method.adapter(setting, None, hyper)  # without weights, since it never acts
         state = jax.eval_shape(adapter.init, jax.random.key(0), jnp.zeros(env.spec.goal_dim))
-    except Exception:  # a method of a user that needs its weights, or settings of an older version
+    except Exception:  # a user's method that needs weights, or settings of an older version
         return None
     return (adapter, state) if adapter.episodes_per_round == 1 else None
 
 
 def blank_episode(spec: EnvSpec) -> Episode:
-    """An episode of which only the return will matter."""
+    """A placeholder episode, for methods that only use its return."""
     steps = spec.horizon
     obs = jnp.zeros((steps, *spec.obs.shape), spec.obs.dtype)
     actions = jnp.zeros((steps, *spec.zero_action().shape), spec.zero_action().dtype)
@@ -127,7 +130,7 @@ def blank_episode(spec: EnvSpec) -> Episode:
 
 
 def _change(before: Arms, after: Arms, prompt: Prompt) -> tuple[Any, Any, Any, Any]:
-    """The row that differs, its pulls, its mean, and whether the prompt of the episode is in it."""
+    """The changed row, its pulls, its mean, and whether it holds the prompt of the episode."""
     num = len(before.pulls)
     differs = jnp.zeros(num, bool)
     for old, new in zip(_rows(before), _rows(after), strict=True):
@@ -141,5 +144,5 @@ def _change(before: Arms, after: Arms, prompt: Prompt) -> tuple[Any, Any, Any, A
 
 
 def _rows(arms: Arms) -> list[jax.Array]:
-    """Everything that a table has in rows."""
+    """The arrays of a table that have a row for each arm."""
     return [leaf for leaf in jax.tree.leaves(arms) if jnp.ndim(leaf)]

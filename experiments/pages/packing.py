@@ -1,4 +1,4 @@
-"""Arrays as text in a page: base64 of the deflated bytes of all of them, one after another."""
+"""Arrays as text in a page: their bytes are concatenated, deflated and encoded in base64."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 DTYPES = ("float32", "float16", "uint8", "uint16", "uint32")
-"""What a page can read (``js/arrays.js``)."""
+"""The dtypes that a page can read (``js/arrays.js``)."""
 
 
 def packed(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Arrays as JSON values. Their bytes are little-endian, whatever the machine."""
+    """Encode arrays as JSON values. Their bytes are little-endian on every machine."""
     parts, entries = [], []
     for name, array in arrays.items():
         if str(array.dtype) not in DTYPES:
@@ -26,7 +26,7 @@ def packed(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def unpacked(values: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """What ``packed`` made JSON of."""
+    """Decode what ``packed`` returned."""
     content, at, arrays = zlib.decompress(base64.b64decode(values["bytes"])), 0, {}
     for entry in values["arrays"]:
         dtype = np.dtype(entry["type"]).newbyteorder("<")
@@ -38,5 +38,5 @@ def unpacked(values: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 
 def smallest(array: np.ndarray) -> np.ndarray:
-    """Integers from 0 on in as few bytes as they need."""
+    """Non-negative integers in the smallest unsigned dtype that holds them."""
     return array.astype(np.min_scalar_type(int(array.max(initial=0))))

@@ -1,9 +1,9 @@
-"""What a plan knew after each episode, recomputed by telling it the recorded episodes again.
+"""What the method ``plan`` knew after each episode, recomputed by telling it the recorded episodes again.
 
-A plan keeps one of three models of its task (``mgpo_jax.planning``): a map, an order, or an estimate of
-what prompts are worth. For the first two the episodes are played again, from their actions by the rules of
-the world, since a plan learns from their steps; the estimate needs their returns alone. Nobody acts, so
-that no weights are needed.
+A plan keeps one of three models of its task (``mgpo_jax.planning``): a map, an order, or an estimate of the
+worths of prompts. The first two learn from the steps of episodes, so the episodes are replayed from their
+actions by the rules of the world; the estimate only needs returns. The policy never acts, so no weights are
+needed.
 """
 
 from __future__ import annotations
@@ -29,43 +29,44 @@ from mgpo_jax.planning.worths import WorthState, posterior
 from mgpo_jax.prompts import Prompt
 from mgpo_jax.rollout import Query
 
-NUM_BEST = 5  # prompts of an estimate that a page shows
-TIED = 1e-4  # posterior means that differ by less are equal but for rounding
+NUM_BEST = 5  # number of best prompts that a page shows of an estimate
+TIED = 1e-4  # posterior means that differ by less are equal up to rounding
 
 Arrays = dict[str, np.ndarray]
 Read = Callable[[Any], Any]
-"""``(state) -> pytree``: what is read off a plan after each episode."""
+"""``(state) -> pytree``: extracts what to record from the state of a plan."""
 
 
 class Told(NamedTuple):
-    """The episodes of one task, with leaves ``[S, E, ..]``, as a plan is told them."""
+    """The episodes of one task that a plan is told, leaves ``[S, E, ..]``."""
 
     goals: Any
     mask: Any
     greedy: Any
     returns: Any
     episodes: Any
-    """``Episode``; one without leading axes where only the return matters."""
+    """``Episode`` records, or placeholders if only the returns matter."""
 
 
 def plan_of(results: Results) -> Arrays:
-    """What a plan knew after each episode as arrays for the page; none for another method.
+    """What a plan knew after each episode, as arrays for the page; empty for another method.
 
     Axes: S seeds, N tasks, E episodes, M goals of one search. For a map and an order, ``knownGoals [K, G]``
-    are different goals and ``known [S, N, M]`` those that each search found until its end, as places in
-    them plus 1, in the order in which it found them; 0 stands for none.
+    are unique goals, and ``known [S, N, M]`` lists those that each search found by its end, in order of
+    discovery, as indices into them plus 1; 0 stands for none.
 
-    - of a map: ``visits [S, N, E, M]``, in each episode; ``wayCounts [S, N, E]`` and ``ways``, the states
-      of the shortest known way after the start, see ``_changed``; ``verified [S, N, E]``, the steps of the
-      shortest greedy episode that arrived, 0 before.
-    - of an order: ``prefix [S, N, E, W]``, the confirmed goals in their order as places in ``known`` plus
-      1; ``excluded [S, N, E, M]``, which are not the next; ``complete [S, N, E]``.
-    - of an estimate: ``worthEpisode [S, N, E, 5]``, the episode that first tried each of the best prompts,
-      from 1 on, 0 for none; ``worthMean`` and ``worthStd``, the posterior of their mean returns.
+    - Map: ``visits [S, N, E, M]`` in each episode; ``wayCounts [S, N, E]`` and ``ways``, the states of the
+      shortest known path after the start (see ``_encode_changes``); ``verified [S, N, E]``, the steps of
+      the shortest greedy episode so far that arrived, or 0.
+    - Order: ``prefix [S, N, E, W]``, the confirmed goals in order, as indices into ``known`` plus 1;
+      ``excluded [S, N, E, M]``, goals that are known not to be next; ``complete [S, N, E]``, whether the
+      order is known completely.
+    - Estimate: ``worthEpisode [S, N, E, 5]``, the episodes, counted from 1, that first tried each of the
+      best prompts, or 0; ``worthMean`` and ``worthStd``, the posterior of their mean returns.
 
     Raises:
-      DataError: if the method, as it is now, does not come to the prompts on record, or the results do not
-        hold what it learned from.
+      DataError: if the present version of the method does not arrive at the recorded prompts, or the
+        results lack what it learned from.
     """
     found = told_adapter(results)
     if found is None:
@@ -75,13 +76,13 @@ def plan_of(results: Results) -> Arrays:
     if isinstance(state, models) and results.episodes_used is not None:
         raise DataError("what a plan knew is not shown of searches that ended early (--stop-at)")
     if isinstance(state, MapState):
-        return _map_of(results, adapter)
+        return _map_arrays(results, adapter)
     if isinstance(state, OrderState):
-        return _order_of(results, adapter)
-    return _worth_of(results, adapter) if isinstance(state, WorthState) else {}
+        return _order_arrays(results, adapter)
+    return _worth_arrays(results, adapter) if isinstance(state, WorthState) else {}
 
 
-def _map_of(results: Results, adapter: Adapter) -> Arrays:
+def _map_arrays(results: Results, adapter: Adapter) -> Arrays:
     if results.actions is None:
         raise DataError("these results hold no actions, from which a map could be drawn again")
     spec = results.environment.spec
@@ -96,7 +97,7 @@ def _map_of(results: Results, adapter: Adapter) -> Arrays:
         best = adapter.best(state).prompt
         return state.table.visits.astype(jnp.uint16), states.astype(jnp.int16), state.verified, best
 
-    (goals, size), (visits, ways, verified, best) = _tell(
+    (goals, size), (visits, ways, verified, best) = _tell_episodes(
         results, adapter, read, lambda state: (state.table.goals, state.table.size)
     )
     if not _same_prompts(best, results).all():
@@ -105,9 +106,9 @@ def _map_of(results: Results, adapter: Adapter) -> Arrays:
     gained = np.diff(visits[..., :num].astype(np.int32), axis=2, prepend=0)
     if gained.min() < 0:  # without splices, a better episode replaces the whole map
         raise DataError("a map that forgets what it has seen cannot be shown")
-    counts, rows = _changed(ways)
+    counts, rows = _encode_changes(ways)
     return {
-        **_lists_of_goals(goals[:, :, :num], size),
+        **_known_goals(goals[:, :, :num], size),
         "visits": smallest(gained),
         "wayCounts": smallest(counts),
         "ways": smallest(rows),
@@ -115,12 +116,12 @@ def _map_of(results: Results, adapter: Adapter) -> Arrays:
     }
 
 
-def _changed(ways: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ways ``[S, N, E, T]`` as those that differ from the one before, one after another.
+def _encode_changes(ways: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Encode paths ``[S, N, E, T]`` as those that differ from the path after the previous episode.
 
     Returns:
-      ``[S, N, E]``, 0 for the way before (or for none, in the first episode) and else the number of its
-      states plus 1; and the states of all that are new.
+      ``[S, N, E]``: 0 if the path is unchanged (or, in the first episode, if there is none), otherwise the
+      number of its states plus 1; and the concatenated states of all changed paths.
     """
     before = np.roll(ways, 1, axis=2)
     before[:, :, 0] = UNKNOWN
@@ -129,12 +130,12 @@ def _changed(ways: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return counts, ways[(ways != UNKNOWN) & is_new[..., None]]
 
 
-def _order_of(results: Results, adapter: Adapter) -> Arrays:
+def _order_arrays(results: Results, adapter: Adapter) -> Arrays:
     def read(state: OrderState) -> Any:
         order = state.order
         return order.prefix, order.excluded, order.complete, adapter.best(state).prompt
 
-    (goals, size), (prefix, excluded, complete, best) = _tell(
+    (goals, size), (prefix, excluded, complete, best) = _tell_episodes(
         results, adapter, read, lambda state: (state.order.goals, state.order.size)
     )
     if results.environment.spec.deterministic:
@@ -145,7 +146,7 @@ def _order_of(results: Results, adapter: Adapter) -> Arrays:
         raise disagreement(results)
     num = int(size.max())
     return {
-        **_lists_of_goals(goals[:, :, :num], size),
+        **_known_goals(goals[:, :, :num], size),
         "prefix": smallest(prefix - NONE),
         "excluded": excluded[..., :num].astype(np.uint8),
         "complete": complete.astype(np.uint8),
@@ -155,9 +156,9 @@ def _order_of(results: Results, adapter: Adapter) -> Arrays:
 def _follows(
     results: Results, goals: np.ndarray, prefix: np.ndarray, complete: np.ndarray
 ) -> np.ndarray:
-    """``[S, N, E]``: whether the best prompts on record begin with what is confirmed.
+    """``[S, N, E]`` whether the recorded best prompts begin with the confirmed goals.
 
-    Once the order is complete, one goal of it may be missing. A plan draws what follows at random.
+    Once the order is complete, one of its goals may be missing. The goals after it are drawn at random.
     """
     found, masks = results.best["prompt.goals"], results.best["prompt.mask"]
     fits = np.zeros(prefix.shape[:3], bool)
@@ -174,7 +175,7 @@ def _follows(
     return fits
 
 
-def _worth_of(results: Results, adapter: Adapter) -> Arrays:
+def _worth_arrays(results: Results, adapter: Adapter) -> Arrays:
     spec = results.environment.spec
 
     def read(state: WorthState) -> Any:
@@ -182,14 +183,14 @@ def _worth_of(results: Results, adapter: Adapter) -> Arrays:
             return state.returns, jnp.zeros_like(state.returns)
         return posterior(state, state.kernel)
 
-    _, (mean, std) = _tell(results, adapter, read, lambda state: (), blank_episode(spec))
+    _, (mean, std) = _tell_episodes(results, adapter, read, lambda state: (), blank_episode(spec))
     shape = results.returns.shape
     worths = [np.zeros((*shape, NUM_BEST), dtype) for dtype in (np.int64, np.float32, np.float32)]
     for seed, task in np.ndindex(*shape[:2]):
-        rows = _rows_of(results.choices, (seed, task))
+        rows = _prompt_rows(results.choices, (seed, task))
         _, first, number = np.unique(rows, axis=0, return_index=True, return_inverse=True)
         first = first[number.ravel()]  # the episode that first had this prompt
-        held = _rows_of(results.best, (seed, task))
+        held = _prompt_rows(results.best, (seed, task))
         for episode in range(shape[2]):
             means = np.where(first == np.arange(len(first)), mean[seed, task, episode], -np.inf)
             means = means[: episode + 1]
@@ -208,21 +209,21 @@ def _worth_of(results: Results, adapter: Adapter) -> Arrays:
     }
 
 
-def _rows_of(part: Arrays, where: tuple[int, int]) -> np.ndarray:
-    """The prompts ``[E, P * (G + 1)]`` of one search, with zeros in the slots that are not used."""
+def _prompt_rows(part: Arrays, where: tuple[int, int]) -> np.ndarray:
+    """The prompts ``[E, P * (G + 1)]`` of one search, with zeros in unused slots."""
     goals, mask = part["prompt.goals"][where], part["prompt.mask"][where][..., None]
     return np.concatenate([np.where(mask, goals, 0), mask], axis=-1).reshape(len(goals), -1)
 
 
 def _same_prompts(found: Any, results: Results) -> np.ndarray:
-    """``[S, N, E]``: which prompts are the best ones on record."""
+    """``[S, N, E]`` whether prompts equal the recorded best ones."""
     goals, mask = results.best["prompt.goals"], results.best["prompt.mask"]
     same_goals = np.where(mask[..., None], found.goals == goals, True).all(axis=(-1, -2))
     return (found.mask == mask).all(axis=-1) & same_goals
 
 
-def _lists_of_goals(goals: np.ndarray, size: np.ndarray) -> Arrays:
-    """The first ``size [S, N]`` of the goals ``[S, N, M, G]`` of each search; see ``plan_of``."""
+def _known_goals(goals: np.ndarray, size: np.ndarray) -> Arrays:
+    """The first ``size [S, N]`` goals ``[S, N, M, G]`` of each search as arrays; see ``plan_of``."""
     real = np.arange(goals.shape[2]) < size[..., None]
     table, index = np.unique(goals[real], axis=0, return_inverse=True)
     places = np.zeros(real.shape, np.int64)
@@ -230,7 +231,7 @@ def _lists_of_goals(goals: np.ndarray, size: np.ndarray) -> Arrays:
     return {"knownGoals": table.astype(np.float32), "known": smallest(places)}
 
 
-def _tell(
+def _tell_episodes(
     results: Results, adapter: Adapter, read: Read, last: Read, blank: Episode | None = None
 ) -> tuple[Any, Any]:
     """Tell a method all recorded episodes.
@@ -238,16 +239,14 @@ def _tell(
     Args:
       results: the adaptation.
       adapter: its method.
-      read: what is read off its state after each episode.
-      last: what is read off its last state.
-      blank: an episode that has only a return, where that is all that matters (None: they are played
-        again).
+      read: extracts what to record from the state after each episode.
+      last: extracts what to record from the last state.
+      blank: a placeholder episode, if only returns matter; None to replay the episodes.
 
     Returns:
-      What was read off the last states ``[S, N, ..]`` and after each episode ``[S, N, E, ..]``, with numpy
-      leaves.
+      The result of ``last`` ``[S, N, ..]``, and those of ``read`` ``[S, N, E, ..]``, with numpy leaves.
     """
-    key = jax.random.key(0)  # draws new prompts, of which the record has the real ones
+    key = jax.random.key(0)  # the prompts drawn with it are replaced by the recorded ones
 
     @jax.jit
     @jax.vmap
@@ -280,11 +279,11 @@ def _tell(
 
 
 def _player(results: Results) -> Callable[[int], Episode]:
-    """Plays the episodes ``[S, E]`` of a task again, or puts them together from the goals reached."""
+    """A function that replays the episodes ``[S, E]`` of a task, or rebuilds them from reached goals."""
     env = results.environment
     actions = results.actions
     if actions is None or actions.dtype.kind == "f":
-        return lambda task: _rewarded_in_order(results, env.spec, task)
+        return lambda task: _rebuild_episodes(results, env.spec, task)
 
     @jax.jit
     def play(task: Any, keys: Any, actions: Any, lengths: Any) -> Episode:
@@ -300,12 +299,12 @@ def _player(results: Results) -> Callable[[int], Episode]:
     return lambda task: play(results.task(task), keys[:, task], actions[:, task], lengths[:, task])
 
 
-def _rewarded_in_order(results: Results, spec: EnvSpec, task: int) -> Episode:
-    """The episodes ``[S, E]`` of a task, as far as the goals that they reached tell.
+def _rebuild_episodes(results: Results, spec: EnvSpec, task: int) -> Episode:
+    """Rebuild the episodes ``[S, E]`` of a task from the goals that they reached.
 
-    Which of them were rewarded is not on record. Their number follows from the return, and they are taken
-    to be the first ones of those that the task goal holds: in a world that rewards an order, nothing is
-    rewarded after something wrong.
+    The record does not say which goals were rewarded. Their number follows from the return, and they are
+    taken to be the first of those that are part of the task goal: in a world that rewards an order, nothing
+    is rewarded after a mistake.
     """
     if results.reached is None or not results.num_parts[task]:
         raise DataError("these results hold neither actions nor the goals that episodes reached")

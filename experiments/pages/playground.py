@@ -1,4 +1,4 @@
-"""The playground: a page in which anyone leads a frozen policy, and a search finds prompts for it."""
+"""The playground: a page in which anyone guides a frozen policy, and a search finds prompts for it."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ NETWORK = (
     "goal_dim", "action_dim", "horizon", "max_prompt_length", "embed_dim", "num_layers", "num_heads",
     "obs_mean", "obs_std",
 )  # fmt: skip
-"""What the decoder in the page has to know of a network."""
+"""The entries of a network's config that the decoder in the page needs."""
 
 
 def playground(worlds: Sequence[World], policy: Path | None = None) -> str:
-    """The page of some worlds, with their released policies or the one in a folder.
+    """Make the page of some worlds, with their released policies or the one in a folder.
 
     Raises:
-      UsageError: if a world or a policy cannot be played in a page, or there is no such policy.
+      UsageError: if a page cannot run a world or a policy, or there is no such policy.
       DataError: if a policy is damaged or does not fit its world.
     """
     entries = [world_data(world, load_policy(world, policy)) for world in worlds]
@@ -41,7 +41,7 @@ def playground(worlds: Sequence[World], policy: Path | None = None) -> str:
 
 
 def world_data(world: World, policy: LoadedPolicy) -> dict[str, Any]:
-    """What the page has to know of one world and its policy, as JSON values."""
+    """The data of the page on one world and its policy, as JSON values."""
     page, spec, network = page_of(world), world.make().spec, policy.config
     if page.script is None or page.track is not None:
         raise UsageError(
@@ -73,10 +73,10 @@ def _seen(seen: SeenGoals | None) -> dict[str, Any] | None:
 
 
 def half_weights(policy: LoadedPolicy) -> dict[str, np.ndarray]:
-    """The weights by their names in half precision.
+    """The weights in half precision, by name.
 
     Raises:
-      UsageError: if a weight is too large for it.
+      UsageError: if a weight is too large for half precision.
     """
     flat = flatten_dict(policy.params["params"], sep="/")
     halves = {}

@@ -1,4 +1,4 @@
-"""The report: a page that shows adaptations to the same tasks, down to every episode of them."""
+"""The report: a page that shows adaptations to the same tasks, down to every episode."""
 
 from __future__ import annotations
 
@@ -36,21 +36,21 @@ from experiments.store.summary import ADAPT_AGAIN, method_of
 from experiments.store.tables import number
 
 ENTRY = SCRIPTS / "report.js"
-REPORT = "report.html"  # in the folder of an adaptation
-VERSIONS = ("python", "jax", "numpy")  # of what is in the head
-MOST_BYTES = 5_000_000  # of a page; a larger one leaves out what its episodes did
+REPORT = "report.html"  # name of the report in the folder of an adaptation
+VERSIONS = ("python", "jax", "numpy")  # packages whose versions are shown
+MOST_BYTES = 5_000_000  # maximum size of a page; a larger one leaves out what episodes did
 PICTURES = {".gif": b"GIF8", ".png": b"\x89PNG"}
-"""The pictures that a page can hold, by the end of their names, with how their files begin."""
+"""The pictures that a page can show: their suffixes, and the first bytes of their files."""
 
 
 def write_report(folders: Sequence[Path], out: Path, pictures: Sequence[Path] = ()) -> None:
-    """Write the page of some result folders, whole or not at all; see ``report``."""
+    """Write the page of some result folders atomically; see ``report``."""
     page = report(folders, pictures)
     write_sealed(out, lambda path: path.write_text(page, encoding="utf-8"))
 
 
 def report_of_run(folder: Path) -> None:
-    """Write the page of one adaptation beside its pictures; a page that was changed stays."""
+    """Write the page of one adaptation to its folder; a page that the user changed is kept."""
     out = folder / REPORT
     if not is_kept(out):
         write_report([folder], out)
@@ -58,10 +58,14 @@ def report_of_run(folder: Path) -> None:
 
 
 def report(folders: Sequence[Path], pictures: Sequence[Path] = ()) -> str:
-    """The page of some result folders, with pictures and videos below, and those that lie in the folders.
+    """Make the page of some result folders.
+
+    Args:
+      folders: the result folders; videos in them are shown at the end.
+      pictures: further pictures and videos to show.
 
     Raises:
-      UsageError: if they ran on different tasks, or a picture is none or too large.
+      UsageError: if they ran on different tasks, or a picture is not one or is too large.
       DataError: if a folder is damaged.
     """
     videos = [path for folder in dict.fromkeys(folders) for path in sorted(folder.glob("*.gif"))]
@@ -82,10 +86,10 @@ def report(folders: Sequence[Path], pictures: Sequence[Path] = ()) -> str:
 
 
 def _picture(path: Path) -> dict[str, str]:
-    """A picture or a video as a part of the page.
+    """A picture or a video as data for the page.
 
     Raises:
-      UsageError: if it is no GIF or PNG, or does not fit into a page.
+      UsageError: if it is not a GIF or PNG, or too large for a page.
     """
     begins = PICTURES.get(path.suffix)
     try:
@@ -111,9 +115,12 @@ def _page(data: Mapping[str, Any], results: Results) -> str:
 def report_data(
     found: Mapping[Path, Results], rows: Sequence[Row], with_episodes: bool = True
 ) -> dict[str, Any]:
-    """What the page has to know of adaptations to the same tasks, as JSON values.
+    """The data of the page, as JSON values.
 
-    ``with_episodes`` says whether it can show what every episode did.
+    Args:
+      found: adaptations to the same tasks, by folder.
+      rows: their rows in a table, in the same order.
+      with_episodes: whether to include what every episode did.
     """
     by_label = labeled(found)
     first = next(iter(by_label.values()))
@@ -129,7 +136,7 @@ def report_data(
                 "label": looks[label].name,
                 "color": looks[label].color,
                 "facts": told,
-                "comparison": "" if results is first else _compared(results, first),
+                "comparison": "" if results is first else _comparison(results, first),
                 "note": note,
                 "arrays": packed(arrays),
             }
@@ -149,7 +156,7 @@ def report_data(
 
 
 def _facts(results: Results, row: Row) -> list[tuple[str, str]]:
-    """What was run and what came of it, as names and texts."""
+    """The settings and results of a run, as pairs of a name and a text."""
     summary = row.summary
     low, high = summary["final_return_iqm_95"] or (None, None)
     final = SeedSpread(summary["final_return"], summary["final_return_std_over_seeds"])
@@ -185,14 +192,14 @@ def _facts(results: Results, row: Row) -> list[tuple[str, str]]:
     ]  # fmt: skip
 
 
-def _compared(results: Results, first: Results) -> str:
+def _comparison(results: Results, first: Results) -> str:
     """The paired comparison with the first run, in words."""
     difference, improvement = compare(results, first)
     return f"{difference} in return, better with probability {improvement}"
 
 
 def _knowledge(results: Results) -> tuple[dict[str, np.ndarray], str]:
-    """What the search knew after each episode, and a remark where that cannot be shown."""
+    """What the search knew after each episode, and a note if that cannot be shown."""
     try:
         knowledge = knowledge_of(results)
         if knowledge is None:
@@ -203,7 +210,7 @@ def _knowledge(results: Results) -> tuple[dict[str, np.ndarray], str]:
 
 
 def _arrays_of(results: Results, page: Page, with_episodes: bool) -> dict[str, np.ndarray]:
-    """The arrays of one run: returns, prompts, and what its episodes did as far as it is known."""
+    """The arrays of one run: returns, prompts, and what its episodes did, as far as that is known."""
     arrays = {
         "returns": results.returns.astype(np.float32),
         "evalEpisodes": results.eval_episodes.astype(np.uint32),
@@ -235,11 +242,11 @@ def _arrays_of(results: Results, page: Page, with_episodes: bool) -> dict[str, n
 
 
 def _prompts(results: Results, index: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
-    """Prompts as rows of a table, numbered in the order in which they first appear.
+    """Prompts as rows of a table, numbered in order of first appearance.
 
     Args:
       results: the adaptation.
-      index: for who acted and for the best choice, the places of their goals in the table of goals.
+      index: indices into the table of goals, of the goals of the acting and of the best choices.
     """
     filled = []
     for part, places in zip((results.choices, results.best), index, strict=True):
@@ -262,9 +269,9 @@ def _prompts(results: Results, index: Sequence[np.ndarray]) -> dict[str, np.ndar
 
 
 def _new_or_known(numbers: np.ndarray) -> np.ndarray:
-    """Numbers that count from 0 as they first appear: 0 for a new one, else itself plus 1.
+    """Replace the first appearance of each number by 0, and all others by the number plus 1.
 
-    Most are new, so that this deflates to half of the size.
+    Numbers must first appear in ascending order, from 0. Most are new, so this halves the compressed size.
     """
     _, first = np.unique(numbers, return_index=True)
     coded = numbers + 1
@@ -273,9 +280,9 @@ def _new_or_known(numbers: np.ndarray) -> np.ndarray:
 
 
 def _actions(results: Results, page: Page) -> dict[str, np.ndarray]:
-    """The actions of all episodes one after another, for a world whose rules are in the page.
+    """The actions of all episodes, concatenated, for a world whose rules are in the page.
 
-    Behind noise there are none: the rules do not know what it did to the actions.
+    Under noise there are none, since the rules do not know how the noise changed the actions.
     """
     actions = results.actions
     noisy = results.environment != results.world.make()
@@ -291,7 +298,7 @@ def _actions(results: Results, page: Page) -> dict[str, np.ndarray]:
 
 
 def _starts(results: Results, page: Page) -> np.ndarray:
-    """``[S, N, E, ..]`` what the rules have to know of the first observation of each episode."""
+    """``[S, N, E, ..]`` what the rules need of the first observation of each episode."""
     assert results.keys is not None
     assert page.start is not None
     env = results.world.make()

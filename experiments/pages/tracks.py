@@ -1,4 +1,4 @@
-"""What a drawing has to know of saved episodes whose rules are not in the page: jax plays them again."""
+"""Tracks: the data to draw saved episodes of worlds whose rules are not in the page, replayed with jax."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ from envs.wrappers import Wrapper
 from experiments.pages.packing import smallest
 from experiments.store.results import Results
 
-MOST_STEPS = 750_000  # are played again; of more, every second, third .. episode of each search is
-# Episodes at once: more are no faster on a CPU. What is played again is checked against the record.
-BATCH = 64
+MOST_STEPS = 750_000  # maximum number of steps to replay; if there are more, episodes are skipped
+BATCH = 64  # episodes to replay at once; more are no faster on a CPU
 
 
 @dataclass(frozen=True)
 class Tracked(Wrapper):
-    """A world in which the agent sees what a drawing has to know (``Page.track``), for episodes that are
-    played again. Its ``spec`` still tells of what the agent saw then."""
+    """A wrapper whose observations are the data for a drawing (``Page.track``), for replaying episodes.
+
+    Its ``spec`` still describes the original observations.
+    """
 
     track: Callable[[State], Array]
 
@@ -40,14 +41,17 @@ class Tracked(Wrapper):
 
 
 def tracks_of(results: Results, page: Page) -> dict[str, np.ndarray]:
-    """The tracks of the episodes of a world that has them, as arrays for the page.
+    """The tracks of the episodes as arrays for the page.
 
     Returns:
-      ``trackStride [1]``, of how many episodes the first is played again; ``trackCounts [S, N, E]``, how
-      many moments of each episode are known: its steps and 1, or 0 where it was not played again, or did
-      not come to the goals on record; and ``track [D, total]``, the numbers of all of them, one episode
-      after another, as differences to the moment before, modulo 256. Nothing where the world has no tracks
-      or the results hold no actions, and behind noise.
+      An empty dictionary if the world has no tracks, the results have no actions, or there was noise;
+      otherwise
+
+      - ``trackStride [1]``: n, if every n-th episode of each search is replayed.
+      - ``trackCounts [S, N, E]``: the number of moments of each episode, which is its steps plus 1; 0 if it
+        was not replayed, or the replay does not match the record.
+      - ``track [D, total]``: the tracks of all episodes, concatenated, as differences from the previous
+        moment modulo 256.
     """
     actions, keys = results.actions, results.keys
     if page.track is None or actions is None or actions.dtype.kind == "f":
@@ -70,18 +74,18 @@ def tracks_of(results: Results, page: Page) -> dict[str, np.ndarray]:
         played = episode.trajectory
         return played.obs, episode.last_obs, played.length, played.goal_reached
 
-    # Episodes of about one length together, since a batch runs as long as its longest one.
+    # Batch episodes of similar length, since a batch runs as long as its longest episode.
     order, counts = np.argsort(-lengths[chosen], kind="stable"), np.zeros_like(lengths)
     rows = [np.zeros((0, 0), np.uint8)] * len(where)
     for start in range(0, len(order), BATCH):
-        batch = np.resize(order[start : start + BATCH], BATCH)  # all batches of one shape
+        batch = np.resize(order[start : start + BATCH], BATCH)  # the same shape for all batches
         at = tuple(where[batch].T)
         tasks = jax.tree.map(lambda leaf, i=at[1]: jnp.asarray(leaf)[i], results.task_set)
         found = map(np.asarray, play(tasks, keys[at], actions[at], lengths[at]))
         for number, seen, last, length, reached in zip(batch, *found, strict=True):
             place = tuple(where[number])
             row = np.concatenate([seen[:length], last[None]])
-            fits = length == lengths[place] and _as_on_record(results, place, reached)
+            fits = length == lengths[place] and _matches_record(results, place, reached)
             counts[place] = len(row) if fits else 0
             rows[number] = np.diff(row, axis=0, prepend=np.zeros_like(row[:1]))[: counts[place]]
     return {
@@ -91,8 +95,8 @@ def tracks_of(results: Results, page: Page) -> dict[str, np.ndarray]:
     }
 
 
-def _as_on_record(results: Results, place: tuple[int, ...], reached: np.ndarray) -> bool:
-    """Whether an episode reached goals ``[T]`` in the steps on record, as far as they are kept."""
+def _matches_record(results: Results, place: tuple[int, ...], reached: np.ndarray) -> bool:
+    """Whether a replayed episode reached goals (mask ``[T]``) in the recorded steps, if there are any."""
     if results.reached is None:
         return True
     return np.array_equal(np.flatnonzero(reached), results.reached_in(*place)[0])

@@ -1,4 +1,4 @@
-"""What the worlds of a page bring to it."""
+"""What worlds contribute to pages."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from mgpo_jax.tasks import num_tasks, task_at
 
 
 def page_of(world: World) -> Page:
-    """What a world brings to pages; an empty record for a world that brings nothing."""
+    """The ``Page`` record of a world; an empty record for a world without one."""
     return Page() if world.page is None else world.page(world.make())
 
 
 def tasks_in_page(page: Page, tasks: Task) -> list[dict[str, Any]]:
-    """N stacked tasks: what the world's script knows of each, and each in a few words."""
+    """Tasks as JSON values: for each the data for the world's script, and a short description."""
     rows = []
     for index in range(num_tasks(tasks)):
         one = jax.tree.map(np.asarray, task_at(tasks, index))

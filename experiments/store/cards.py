@@ -64,11 +64,11 @@ class Finished(NamedTuple):
     """Its metrics."""
     command: str
     variants: dict[str, int]
-    """How many trajectories of its dataset are of each variant of the world (empty: not known)."""
+    """Number of trajectories of each variant of the world in its dataset; empty if unknown."""
 
     @property
     def released(self) -> Path:
-        """Where the world's released policy lies."""
+        """The folder of the world's released policy."""
         return released_folder(self.world, self.kind.name)
 
     @property
@@ -82,14 +82,14 @@ def read_run(source: Path, env: str | None = None) -> Finished:
 
     Args:
       source: its folder.
-      env: the name or place of its world, as a user gives it.
+      env: its world, by name or as module:attribute, if the user gave one.
 
     Raises:
       DataError: if a file is missing or damaged, or the policy does not fit the world that it names.
-      UsageError: if the run has no policy, or is of another world than ``env``.
+      UsageError: if the run has no policy, or is from another world than ``env``.
     """
     policy, path = read_policy(source / "policy"), source / "policy" / CONFIG
-    given = envs.find(env) if env is not None else None  # from now on files may name its place
+    given = envs.find(env) if env is not None else None  # imports it, so that files may name it
     name, settings = policy.made.get("env"), policy.made.get("config")
     if name is None or not isinstance(settings, dict):
         raise DataError(f"{path} lacks made.env or made.config; {RESUME}")
@@ -117,7 +117,7 @@ def read_run(source: Path, env: str | None = None) -> Finished:
 
 
 def cpu_minutes(rows: Sequence[dict[str, Any]]) -> float:
-    """CPU time of a training, from its metrics."""
+    """The CPU-minutes of a training, from its metrics."""
     starts = [0, *(row["step"] for row in rows)]
     spans = [row["step"] - start for start, row in zip(starts, rows, strict=False)]
     seconds = (row["cpu_seconds_per_step"] * n for row, n in zip(rows, spans, strict=True))
@@ -125,7 +125,7 @@ def cpu_minutes(rows: Sequence[dict[str, Any]]) -> float:
 
 
 def card(run: Finished) -> str:
-    """The text that describes a released policy."""
+    """The model card of a released policy, in Markdown."""
     settings, last, env = run.settings, run.rows[-1], run.world.make()
     num_weights = sum(leaf.size for leaf in jax.tree.leaves(run.policy.params))
     facts = run.kind.load().facts(run.policy.config)
@@ -172,15 +172,15 @@ def card(run: Finished) -> str:
 
 
 def _variants(run: Finished) -> str:
-    """What a card says of the variants of the world in a dataset."""
+    """The text of a card on the variants of the world in the dataset; empty without any."""
     counts = [f"{count:,} in {printable(name)}" for name, count in run.variants.items()]
     return f" ({', '.join(counts)})" if counts else ""
 
 
 def _begun(run: Finished) -> str:
-    """The rows of a card that say which policy a training began from; empty for random weights.
+    """The rows of a card on the policy that a training started from; empty for random weights.
 
-    The second row tells how that policy was trained, which its copy in the run knows.
+    The second row says how that policy was trained, according to its copy in the run.
     """
     if run.settings.init is None:
         return ""
@@ -202,16 +202,16 @@ def _begun(run: Finished) -> str:
 
 
 def _origin(place: Path, made: Mapping[str, Any]) -> str:
-    """The policy that a training began from, in words."""
+    """The policy that a training started from, in words."""
     sha256 = printable(str(made.get("init_sha256", "(not known)")))
     return f"the weights of the policy {printable(str(place))}, SHA-256 {sha256}"
 
 
 def release(run: Finished, folder: Path) -> None:
-    """Write the released form of a run to a new folder, which appears when all of it is there."""
+    """Write the released files of a run to a new folder, which appears only when it is complete."""
     with new_folder(folder) as place:
         for name in (WEIGHTS, CONFIG, GOALS):
-            if (run.source / "policy" / name).is_file():  # an older run kept no goals
+            if (run.source / "policy" / name).is_file():  # older runs have no goals
                 shutil.copy(run.source / "policy" / name, place / name)
         shutil.copy(run.source / METRICS, place)
         training_curve(run.rows).savefig(place / "training.png")

@@ -1,4 +1,4 @@
-"""The metrics of a pre-training run: one JSON object a line in ``metrics.jsonl``."""
+"""The metrics of a pre-training run: one JSON object per line in ``metrics.jsonl``."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def read_metrics(path: Path, names: Collection[str] = ()) -> list[dict[str, Any]
       names: metrics that the last row must have.
 
     Raises:
-      DataError: if it is missing or has no rows, a line is no JSON object of numbers with a later step than
-        the one before, or the last row lacks a metric.
+      DataError: if the file is missing or has no rows, a line is not a JSON object of finite numbers, steps
+        do not ascend, or the last row lacks one of ``names``.
     """
     rows = read_json_lines(path, dict[str, Annotated[float, AllowInfNan(False), Strict()]], RESUME)
     if not rows:
@@ -64,11 +64,11 @@ def salvaged_rows(path: Path, last_step: int) -> list[dict[str, float]]:
     return rows
 
 
-LOGGERS = {"tb": "tensorboardX", "wandb": "wandb"}  # by setting, the package that it needs
+LOGGERS = {"tb": "tensorboardX", "wandb": "wandb"}  # settings, and the packages that they need
 
 
 def check_loggers(config: PretrainConfig) -> None:
-    """Raise ``UsageError`` for a logger that is asked for and not installed."""
+    """Raise ``UsageError`` for a requested logger that is not installed."""
     for setting, module in LOGGERS.items():
         if getattr(config, setting):
             _optional(module, setting)
@@ -80,8 +80,8 @@ class Metrics:
     Args:
       folder: the run folder.
       config: settings of the run.
-      rows: what was measured before, as the checkpoint tells that the run goes on from; the file then
-        holds these rows and no others.
+      rows: the rows so far, from the checkpoint that the run resumes from; they replace what is in the
+        file.
     """
 
     def __init__(

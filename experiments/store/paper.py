@@ -1,4 +1,4 @@
-"""The paper's numbers, which are data: by table, world and row."""
+"""The paper's numbers, from ``paper.toml``, by table, world and row."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ def _numbers() -> dict[str, Any]:
 
 
 def paper_rows(table: str, world: str) -> dict[str, Any]:
-    """The rows of a table for a world; none if the paper does not have them."""
+    """The rows of a table for a world; empty if the paper has none."""
     return _numbers().get(table, {}).get(world, {})
 
 
 def paper_worlds(table: str) -> tuple[str, ...]:
-    """The worlds that a table or figure of the paper has, in its order."""
+    """The worlds in a table or figure of the paper, in its order."""
     numbers = _numbers()
     return tuple(numbers.get(table, numbers["figures"].get(table, ())))
 
 
 METHODS_IN = ("table2", "table1", "table8")
-"""The tables with a row for each method, whose numbers agree where two of them have a method."""
+"""The tables with a row for each method; their numbers agree if a method is in several of them."""
 
 
 def paper_final(world: str, method: str) -> str:
@@ -43,10 +43,10 @@ def paper_final(world: str, method: str) -> str:
 def paper_value(table: str, world: str, row: str) -> str:
     """One number as the paper prints it; empty if it has none.
 
-    A world that acts with the policy of another one has that one's numbers. The name may come from a file:
-    a place is not imported for it.
+    A world that uses the released policy of another world has that world's numbers. The name may come from
+    a file, so a module:attribute is not imported.
     """
     if world in WORLDS.names():
-        with suppress(UsageError):  # a world that cannot be imported has no other name
+        with suppress(UsageError):  # a world that cannot be imported keeps its name
             world = WORLDS.find(world).home
     return paper_rows(table, world).get(row, "")

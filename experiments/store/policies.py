@@ -1,4 +1,4 @@
-"""The policy that an adaptation was made with."""
+"""Find and load the policy that an adaptation was made with."""
 
 from __future__ import annotations
 
@@ -20,35 +20,35 @@ GIVE = "give the folder of the one that they were made with by --policy"
 
 
 def load_policy_of(results: Results, world: World, override: Path | None = None) -> LoadedPolicy:
-    """The policy that an adaptation was made with, checked against a world to act in.
+    """Load the policy that an adaptation was made with, and check that it fits a world.
 
     Args:
       results: the adaptation.
-      world: where the policy is to act.
-      override: folder of the policy (default: the first of the places where it may lie by now).
+      world: the world that the policy is to act in.
+      override: folder of the policy (default: the first of ``places_of_policy`` that has it).
 
     Raises:
-      DataError: if it is at none of its places, or only damaged, with other weights or unfit for the world.
+      DataError: if it is not found, is damaged, has other weights or does not fit the world.
     """
     places = [override] if override is not None else places_of_policy(results)
     there = [place for place in places if (place / CONFIG).is_file()] or places[:1]
     if override is None and not (there[0] / CONFIG).is_file():
         listed = ", ".join(str(place) for place in places)
-        raise DataError(f"the policy of {_told(results)} is not in {listed}; {GIVE}")
+        raise DataError(f"the policy of {_name(results)} is not in {listed}; {GIVE}")
     faults: list[DataError] = []
     for place in there:
         try:
             policy = load_policy(world, place, policy_kind(results.method))
             check_weights(results, policy, f"{GIVE}, or {ADAPT_AGAIN}")
             return policy
-        except DataError as error:  # the policy may lie at the next place
+        except DataError as error:  # the policy may be in the next place
             faults.append(error)
     raise faults[0]
 
 
 def places_of_policy(results: Results) -> list[Path]:
-    """Where the policy of an adaptation may lie: beside results that were moved with it, where it was when
-    they were made, or where that is from here."""
+    """Where the policy of an adaptation may be: relative to the results, if both were moved together, and
+    at the absolute and relative paths that it had when they were made."""
     policy, folder = results.config.get("policy"), results.folder
     if not policy:
         return [released_folder(results.world, policy_kind(results.method))]
@@ -57,19 +57,19 @@ def places_of_policy(results: Results) -> list[Path]:
 
 
 def seen_goals_of(results: Results) -> SeenGoals | None:
-    """The goals that the policy of an adaptation was trained on, where it still lies; None if not known."""
+    """The goals that the policy of an adaptation was trained on; None if it is not found or has none."""
     made_with = results.summary.get("policy_sha256")
     for place in places_of_policy(results):
         try:
             if made_with and hash_in_config(place) == made_with:
                 return read_seen_goals(place)
-        except DataError:  # a damaged policy takes no report away
+        except DataError:  # a damaged policy must not prevent a report
             continue
     return None
 
 
 def far_prompts(results: Results) -> str:
-    """A sentence on optimized prompts with goals far from the training; empty if there are none."""
+    """A warning of optimized prompts with goals far from the training; empty if there are none."""
     if "prompt.goals" not in results.best:  # the method has no prompts
         return ""
     goals, mask = (results.best[name][:, :, -1] for name in ("prompt.goals", "prompt.mask"))
@@ -77,14 +77,14 @@ def far_prompts(results: Results) -> str:
 
 
 def check_weights(results: Results, policy: LoadedPolicy, mend: str) -> None:
-    """Raise ``DataError``, which ends in ``mend``, if an adaptation was made with other weights."""
+    """Raise ``DataError``, with ``mend`` in the message, if an adaptation was made with other weights."""
     made_with = results.summary.get("policy_sha256", policy.sha256)
     if policy.sha256 != made_with:
         raise DataError(
-            f"the weights in {policy.folder} ({policy.sha256[:12]}) are not those that {_told(results)} "
+            f"the weights in {policy.folder} ({policy.sha256[:12]}) are not those that {_name(results)} "
             f"were found with ({made_with[:12]}): {mend}"
         )
 
 
-def _told(results: Results) -> str:
+def _name(results: Results) -> str:
     return f"the results of {results.env} {results.method}"

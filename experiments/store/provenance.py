@@ -1,4 +1,4 @@
-"""How and with what a result was made."""
+"""Provenance of results: the command, code revision, package versions and devices they were made with."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Place = Annotated[str, StringConstraints(min_length=1, max_length=4096)]
 
 
 class Meta(BaseModel):
-    """What is read of a ``meta.json``; there may be other entries."""
+    """The entries of a ``meta.json`` that are read; there may be others."""
 
     model_config = {**STRICT, "extra": "ignore"}
 
@@ -36,14 +36,14 @@ class Meta(BaseModel):
     versions: dict[str, str] = {}
     devices: list[str] = []
     dataset: Place | None = None
-    """The folder of the dataset of a training."""
+    """Folder of the dataset of a training."""
     dataset_sha256: str = ""
     policy_places: Annotated[list[Place], MaxLen(8)] = []
-    """Where the policy of an adaptation lies: relative to its folder, and absolute."""
+    """Folder of the policy of an adaptation: relative to the results, and absolute."""
 
 
 def read_meta(path: Path, mend: str) -> Meta:
-    """How and with what something was made. What was made by the first version may have no such file.
+    """Read a ``meta.json``. It may be missing if the first version made the results.
 
     Raises:
       DataError: if the file is damaged.
@@ -52,7 +52,7 @@ def read_meta(path: Path, mend: str) -> Meta:
 
 
 def versions() -> dict[str, str]:
-    """Versions of what a result depends on, as far as it is installed."""
+    """The versions of Python and of those packages that results depend on and that are installed."""
     found = {"python": platform.python_version()}
     for name in PACKAGES:
         try:
@@ -63,7 +63,7 @@ def versions() -> dict[str, str]:
 
 
 def provenance() -> dict[str, Any]:
-    """How and with what this process was started, for the run folder."""
+    """The provenance of what this process makes, for its ``meta.json``."""
     import jax
 
     try:

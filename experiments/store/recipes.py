@@ -1,7 +1,7 @@
-"""The general recipe for data of one's own: settings of a training, chosen by sizes. Nothing imports jax.
+"""The recipe for a user's own dataset: settings of a training chosen by its size. Nothing imports jax.
 
-The numbers continue those of the released policies, which were chosen by hand. What was chosen is printed,
-and every flag changes one of them.
+The numbers extrapolate those of the released policies, which were chosen by hand. The choice is printed,
+and each setting can be changed by its flag.
 """
 
 from __future__ import annotations
@@ -12,22 +12,23 @@ from experiments.store.settings import PretrainConfig
 from mgpo_jax.manifest import Facts
 from mgpo_jax.settings import flag
 
-PASSES = 20  # times that a training sees every trajectory
+PASSES = 20  # epochs: how often a training sees each trajectory
 SMALL, LARGE = (
     20_000,
     5_000_000,
-)  # steps in the data below and above which the network has other sizes
-LONG = 200  # steps of a trajectory from which a step is one token
-STEPS_IN_BATCH = 6_400  # as in the released recipes of the mazes
-MOST_SHAPES = 8  # padded lengths that are compiled
-MOST_STANDARDIZED = 100_000  # components of an observation
+)  # steps in the dataset below and above which the network is smaller and larger
+LONG = 200  # mean steps of a trajectory above which each step is one token
+STEPS_IN_BATCH = 6_400  # as in the presets of the mazes
+MOST_SHAPES = 8  # maximum number of padded lengths to compile
+MOST_STANDARDIZED = 100_000  # maximum size of an observation that is standardized
 
 
 def recipe(facts: Facts) -> dict[str, Any]:
-    """Settings of a training on a dataset, by the names of their flags.
+    """The settings of a training on a dataset, by name.
 
-    Wide and deep networks are for much data; batches hold about as many steps whatever the lengths; the
-    longest prompt grows with the episodes; observations are standardized unless they are booleans.
+    Larger datasets get wider and deeper networks, the number of steps in a batch depends little on the
+    lengths, the maximum prompt length grows with the episodes, and observations are standardized unless
+    they are boolean or very large.
     """
     mean, num = facts.mean_length, facts.num_trajectories
     batch = next((size for size in (64, 32) if size * mean <= STEPS_IN_BATCH), 16)
@@ -52,13 +53,13 @@ def recipe(facts: Facts) -> dict[str, Any]:
 
 
 def of_data(facts: Facts, holdout: int) -> dict[str, Any]:
-    """The settings that say how much of a dataset is trained on: all but a tenth, or ``holdout``."""
+    """How much of a dataset to use and to hold out: all of it, and a tenth, but at most ``holdout``."""
     num = facts.num_trajectories
     return {"trajectories": num, "holdout": min(holdout, max(1, num // 10))}
 
 
 def told(config: PretrainConfig, facts: Facts) -> str:
-    """The data of a training and the settings that it has, chosen or given, in words."""
+    """The dataset of a training and its settings, whether chosen or given, in words."""
     actions = f"{facts.num_actions} actions" if facts.num_actions else f"{facts.action_dim} numbers"
     lines = [
         f"data: {facts.num_trajectories:,} trajectories of {facts.mean_length:.1f} steps in the mean and "
@@ -79,7 +80,7 @@ def _as_flag(name: str, value: Any) -> str:
 
 
 def schedule(config: PretrainConfig) -> str:
-    """The learning rate over the steps of a training, in words."""
+    """The length and the learning rate schedule of a training, in words."""
     train = config.train
     seen = train.steps * train.batch_size / max(1, config.data.trajectories - config.holdout)
     warmup = min(train.warmup_steps, train.steps - 1)

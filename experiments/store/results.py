@@ -1,13 +1,12 @@
-"""What an adaptation leaves behind: one schema, written and read here only.
+"""The results of an adaptation, and their files, which only this module writes and reads.
 
-The folder of an adaptation holds
+The result folder of an adaptation contains
 
 - ``results.npz``: the arrays of ``Results``. Names that begin with ``choice.`` and ``best.`` are parts of
-  what the method chose, such as ``choice.prompt.goals``. Goals that episodes reached are stored as places
-  in a table of different goals.
+  what the method chose, such as ``choice.prompt.goals``. Goals that episodes reached are stored as indices
+  into a table of unique goals.
 - ``tasks.npz``: the tasks, one array for each field.
-- ``config.json``: the settings; ``meta.json``: how and with what it was made; ``summary.json``: the numbers
-  that tables show.
+- ``config.json``: the settings; ``meta.json``: provenance; ``summary.json``: the numbers that tables show.
 """
 
 from __future__ import annotations
@@ -41,8 +40,8 @@ from mgpo_jax.settings import Count, Finite, NotNegative, NumEpisodes, NumSeeds,
 from mgpo_jax.tasks import save_tasks, task_arrays, task_at, tasks_from
 from mgpo_jax.trees import named_leaves
 
-FORMAT = 2  # 1 had only prompts as choices, and neither actions nor reached goals
-# Names of format 1 and what they are called now.
+FORMAT = 2  # format 1 had only prompts as choices, and neither actions nor reached goals
+# Names in format 1, and their present names.
 OLD_NAMES = {
     "greedy": "choice.greedy",
     "prompt_goals": "choice.prompt.goals",
@@ -54,12 +53,12 @@ AXES = {
     "S": "seed", "N": "task", "E": "episode", "R": "round", "P": "slot", "T": "step", "G": "number",
     "C": "judgement", "L": "reached goal", "U": "different goal", "M": "named goal",
 }  # fmt: skip
-"""Axes of the arrays by a letter, with their names in messages."""
+"""The axes of arrays, by letter, with their names in messages."""
 SIZES: Sizes = dict.fromkeys(("seed", "task", "episode", "round", "judgement"), range(1, 2**31))
 
 
 def _field(axes: str, dtype: str, **more: Any) -> ArrayField:
-    """What an array must look like, with its axes as letters."""
+    """The schema of an array whose axes are given as letters."""
     shape = [... if axis == "*" else AXES.get(axis) or int(axis) for axis in axes]
     return ArrayField(tuple(shape), dtype, **more)
 
@@ -86,61 +85,66 @@ PART_FIELDS = {
     "prompt.mask": _field("SNRP", "bool"),
     "greedy": _field("SNR", "bool"),
 }
-"""Of the parts of choices that are known; any other is ``OTHER_PART``."""
+"""The schemas of the parts of choices that are known; for others there is ``OTHER_PART``."""
 OTHER_PART = _field("SNR*", "anything", any_value=True)
 REACHED = ("reached_counts", "reached_steps", "reached_index", "reached_table")
 PARTS = frozenset({"choices", "lengths", "keys", "actions", "reached"})
-"""What ``load_results`` can leave out."""
+"""Parts of results that ``load_results`` can leave out."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Results:
-    """One adaptation. Axes: S seeds, N tasks, E episodes, R rounds, G goal size, C judgements."""
+    """The results of one adaptation.
+
+    Axes: S seeds, N tasks, E episodes of the search, R rounds, G goal size, C judgements (evaluations of
+    the best choice).
+    """
 
     config: dict[str, Any]
-    """Settings of the command that made it."""
+    """Settings of the command that made them."""
     tasks: dict[str, np.ndarray]
     """Arrays of the tasks, each [N, ..]."""
     returns: np.ndarray
-    """[S, N, E] returns of the search's episodes."""
+    """[S, N, E] returns of the episodes."""
     choices: dict[str, np.ndarray]
-    """Parts of who acted, each [S, N, R, ..]."""
+    """Parts of the choice that acted in each round, such as its prompt, each [S, N, R, ..]."""
     best: dict[str, np.ndarray]
     """Parts of the best choice after each round, each [S, N, R, ..]."""
     eval_episodes: np.ndarray
-    """[C]: after how many episodes the best choice was judged."""
+    """[C] numbers of episodes after which the best choice was judged."""
     eval_returns: np.ndarray
     """[S, N, C] mean returns of the judging episodes, of which nothing else is kept."""
     optimal_returns: np.ndarray
-    """[N]; NaN where the optimum is unknown."""
+    """[N] optimal returns; NaN if unknown."""
     eval_achieved: np.ndarray | None = None
     """[S, N, C, M] shares of the judging episodes that achieved each of the world's M named goals; None in
     worlds without any."""
     num_scored: np.ndarray | None = None
-    """[S, N, R] prompts scored without an episode until the end of each round; None for methods that learn
-    by episodes alone."""
+    """[S, N, R] prompts scored without an episode until the end of each round; None for methods that only
+    learn from episodes."""
     lengths: np.ndarray | None = None
     """[S, N, E] steps of the episodes."""
     keys: np.ndarray | None = None
-    """[S, N, E, 2] raw random keys of the episodes in a world of chance, from which their starts follow
-    (``envs.episodes.replay``)."""
+    """[S, N, E, 2] raw random keys of the episodes, from which their initial states follow
+    (``envs.episodes.replay``); None in deterministic worlds."""
     actions: np.ndarray | None = None
-    """[S, N, E, T, ..]; small integers have their largest value after the end of an episode."""
+    """[S, N, E, T, ..] actions; after the end of an episode, discrete ones are the largest integer of their
+    dtype."""
     reached: Reached | None = None
-    """The goals that the episodes reached, with their steps."""
+    """The goals that the episodes reached, and the steps in which they did."""
     summary: dict[str, Any] = field(default_factory=dict)
     """The numbers that tables show."""
     folder: Path | None = None
-    """Where they were read; None for those of this process."""
+    """The folder that they were read from; None if they were just made."""
 
     @property
     def env(self) -> str:
-        """Name or place of the world."""
+        """The world, by name or as module:attribute."""
         return self.config["env"]
 
     @property
     def method(self) -> str:
-        """Name or place of the method."""
+        """The method, by name or as module:attribute."""
         return str(self.config.get("method", self.config.get("bandit")))
 
     @property
@@ -149,13 +153,13 @@ class Results:
 
     @cached_property
     def world(self) -> World:
-        """The record of the world; a place in a file is not imported."""
+        """The record of the world; nothing is imported for a module:attribute in a file."""
         where = "the results" if self.folder is None else self.folder / CONFIG
         return WORLDS.known(self.env, where, "--env")
 
     @cached_property
     def environment(self) -> Environment:
-        """The world as it was adapted in, behind noise where there was some."""
+        """The environment that the adaptation ran in, with its noise, if any."""
         config = self.config
         return behind_noise(
             self.world.make(), config.get("obs_noise", 0.0), config.get("action_noise", 0.0)
@@ -163,9 +167,9 @@ class Results:
 
     @cached_property
     def task_set(self) -> Task:
-        """The tasks as the world's record."""
+        """The tasks as a batch of the world's task record."""
         where = "the tasks of the results" if self.folder is None else self.folder / TASKS
-        trusted = self.folder is None  # they were checked when they were drawn or read
+        trusted = self.folder is None  # tasks of this process were checked when drawn or read
         return tasks_from(self.tasks, self.world.make(), where, trusted)
 
     @cached_property
@@ -184,9 +188,9 @@ class Results:
 
     @property
     def episodes_used(self) -> np.ndarray | None:
-        """[S, N] episodes of each search until it ended; None for searches without ``--stop-at``.
+        """[S, N] episodes that each search used; None without ``--stop-at``.
 
-        A search ends after the first judgement that is good enough, or with its budget.
+        A search ends after the first judgement that reaches ``--stop-at``, or when its budget is spent.
         """
         stop_at = self.config.get("stop_at")
         if stop_at is None:
@@ -196,9 +200,9 @@ class Results:
         return self.eval_episodes[last]
 
     def best_goals(self, seed: int, task: int, episodes: int | None = None) -> np.ndarray | None:
-        """The goals [k, G] of the best prompt after some episodes (default: all of them).
+        """The goals [k, G] of the best prompt after some number of episodes (default: all of them).
 
-        None for a method that has no prompts.
+        Returns None for a method without prompts.
         """
         if "prompt.goals" not in self.best:
             return None
@@ -223,10 +227,10 @@ class Results:
         return self.reached.steps[rows], self.reached.goals[rows]
 
     def replay(self, seed: int, task: int, episode: int) -> Episode:
-        """Play one episode of the search again.
+        """Replay one episode of the search.
 
         Raises:
-          DataError: if the results do not hold its actions.
+          DataError: if the results do not contain its actions.
         """
         if self.actions is None:
             raise DataError(
@@ -236,7 +240,7 @@ class Results:
         env, actions = self.environment, self.actions[where]
         if self.lengths is not None:
             length = int(self.lengths[where])
-        else:  # the largest number of the type stands after the end
+        else:  # actions after the end are the largest integer of their dtype
             length = int((actions != np.iinfo(actions.dtype).max).sum())
         raw = np.zeros(2, np.uint32) if self.keys is None else self.keys[where]
         played = jnp.asarray(actions, env.spec.zero_action().dtype)
@@ -246,7 +250,7 @@ class Results:
         )
 
     def most_improved(self, num: int = 4) -> list[int]:
-        """The tasks whose return adaptation raised most, over all seeds, the largest gain first."""
+        """The tasks whose return improved most by adaptation, averaged over seeds, best first."""
         gains = (self.eval_returns[:, :, -1] - self.eval_returns[:, :, 0]).mean(axis=0)
         return np.argsort(-gains, kind="stable")[:num].tolist()
 
@@ -256,7 +260,7 @@ def results_of(
 ) -> Results:
     """The results of an adaptation that was just run.
 
-    Random keys are only kept in worlds of chance: elsewhere the actions determine an episode.
+    Random keys are only kept in stochastic worlds; in others the actions determine an episode.
     """
     return Results(
         config=dict(config),
@@ -281,15 +285,19 @@ def _parts(choice: Any) -> dict[str, np.ndarray]:
 
 
 def save_results(folder: Path, results: Results) -> None:
-    """Write results to a new folder, which appears when all of it is there."""
+    """Write results to a new folder, which appears only when it is complete."""
     with new_folder(folder) as place:
         write_results(place, results, folder, provenance())
 
 
 def write_results(place: Path, results: Results, folder: Path, meta: Mapping[str, Any]) -> None:
-    """Write the files of results into a place that becomes ``folder``.
+    """Write the files of results.
 
-    ``meta`` says how and with what they were made, as ``provenance`` does.
+    Args:
+      place: folder to write to.
+      results: the results.
+      folder: what ``place`` is renamed to afterward, for relative paths.
+      meta: how the results were made, as ``provenance`` describes it.
     """
     arrays = {
         "returns": results.returns,
@@ -323,7 +331,7 @@ def write_results(place: Path, results: Results, folder: Path, meta: Mapping[str
 
 
 def policy_places(folder: Path, policy: str | None) -> list[str]:
-    """Where a policy lies: relative to the results, so that both can be moved together, and absolute."""
+    """Where a policy is: relative to the results, so that both can be moved together, and absolute."""
     if policy is None:
         return []
     absolute = os.path.abspath(policy)
@@ -331,7 +339,7 @@ def policy_places(folder: Path, policy: str | None) -> list[str]:
 
 
 def _compact(reached: Reached) -> dict[str, np.ndarray]:
-    """Reached goals as places in a table of different goals."""
+    """Reached goals as indices into a table of unique goals."""
     table, index = np.unique(reached.goals, axis=0, return_inverse=True)
     return {
         "reached_counts": reached.counts.astype(np.min_scalar_type(reached.counts.max(initial=0))),
@@ -342,14 +350,14 @@ def _compact(reached: Reached) -> dict[str, np.ndarray]:
 
 
 class Config(BaseModel):
-    """What is known of the settings in ``config.json``; there may be others."""
+    """The settings in ``config.json`` that are checked; there may be others."""
 
     model_config = {**STRICT, "extra": "ignore"}
 
     env: Name
     method: Name | None = None
     bandit: Name | None = None
-    """The method, as older versions call it."""
+    """The method, as older versions called it."""
     policy: Place | None = None
     tasks: Place | None = None
     validation: bool = False
@@ -373,7 +381,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     """The settings of results.
 
     Raises:
-      DataError: if ``config.json`` is missing or damaged, or names a world or method that is not known.
+      DataError: if ``config.json`` is missing or damaged, or names an unknown world or method.
     """
     path = folder / CONFIG
     document = read_document(path, dict[str, Json], ADAPT_AGAIN)
@@ -382,13 +390,13 @@ def read_config(folder: Path) -> dict[str, Any]:
     if method is None:
         raise DataError(f"{path} lacks method; {ADAPT_AGAIN}")
     WORLDS.known(config.env, path, "--env")
-    if ":" not in method:  # a place is only shown: nothing is imported for it
+    if ":" not in method:  # module:attribute is only shown, and never imported
         METHODS.known(method, path)
     return document
 
 
 def _check_format(path: Path) -> None:
-    """Raise ``DataError`` for results of a later version."""
+    """Raise ``DataError`` for results in an unknown format, such as that of a later version."""
     found = read_meta(path, ADAPT_AGAIN).format
     if found not in (1, FORMAT):
         raise DataError(
@@ -400,8 +408,8 @@ def load_results(folder: Path, parts: Collection[str] = PARTS) -> Results:
     """Read the folder of one adaptation.
 
     Args:
-      folder: where ``save_results`` wrote it.
-      parts: those of ``PARTS`` that are wanted; nothing else of them is read.
+      folder: the result folder.
+      parts: which of ``PARTS`` to read; the others are left out.
 
     Raises:
       DataError: if a file is missing, unreadable or does not fit the others.
@@ -438,13 +446,13 @@ def load_results(folder: Path, parts: Collection[str] = PARTS) -> Results:
         summary=dict(read_summary(folder)),
         folder=folder,
     )
-    # Saves making the world; older versions did not keep them.
+    # Spares making the world; older versions did not store these.
     vars(results).update((n, arrays[n]) for n in ("task_goals", "num_parts") if n in arrays)
     return results
 
 
 def _check_actions(actions: np.ndarray | None, path: Path) -> None:
-    """Raise ``DataError`` for actions of the wrong number of axes: discrete ones are single integers."""
+    """Raise ``DataError`` for actions with a wrong number of axes."""
     if actions is not None and actions.ndim != (5 if actions.dtype.kind == "f" else 4):
         raise DataError(
             f"{path}: actions has shape {list(actions.shape)} of {actions.dtype}, wanted [seed, task, "
@@ -453,7 +461,7 @@ def _check_actions(actions: np.ndarray | None, path: Path) -> None:
 
 
 def _read_tasks(path: Path, num: int) -> dict[str, np.ndarray]:
-    """The arrays of the tasks; what they must look like is known when their world is."""
+    """The arrays of the tasks; their schema is checked later, when the world is known."""
     fields = {name: _field("N*", "anything") for name in array_names(path, ADAPT_AGAIN)}
     return read_arrays(path, fields, {"task": num}, ADAPT_AGAIN)
 
@@ -461,7 +469,7 @@ def _read_tasks(path: Path, num: int) -> dict[str, np.ndarray]:
 def _read_parts(
     path: Path, config: Mapping[str, Any], parts: Collection[str]
 ) -> dict[str, np.ndarray]:
-    """The arrays of results that are wanted, by their present names."""
+    """The requested arrays of results, by their present names."""
     stored = {OLD_NAMES.get(name, name): name for name in array_names(path, ADAPT_AGAIN)}
     fields = {name: field for name, field in FIELDS.items() if _wanted(name, parts)}
     for name in _parts_of_choices(stored):
@@ -483,11 +491,11 @@ def _wanted(name: str, parts: Collection[str]) -> bool:
 
 
 def _parts_of_choices(stored: Mapping[str, str]) -> list[str]:
-    """Names of the parts of choices: who acted and the best choice have the same ones."""
+    """The names of the parts of choices; ``choice.`` and ``best.`` have the same parts."""
     parts = {*_with_prefix(stored, "choice."), *_with_prefix(stored, "best.")}
-    if "task_goals" not in stored:  # the first version, in which every choice is a prompt
+    if "task_goals" not in stored:  # format 1, in which every choice is a prompt
         parts |= PART_FIELDS.keys()
-    # The first version did not keep whether the best prompt is acted on greedily.
+    # Format 1 did not store whether the policy acts greedily under the best prompt.
     return [
         f"{prefix}{part}"
         for prefix in ("choice.", "best.")
@@ -497,9 +505,9 @@ def _parts_of_choices(stored: Mapping[str, str]) -> list[str]:
 
 
 def _check_values(arrays: Mapping[str, np.ndarray], path: Path) -> None:
-    """Raise ``DataError`` for numbers that contradict each other."""
+    """Raise ``DataError`` for arrays that contradict each other."""
     judged, num = arrays["eval_episodes"], arrays["returns"].shape[2]
-    # The first is of the initial choice, the second may be of what the first episode has changed.
+    # Two judgements may follow the first episode: of the initial choice, and of what it has changed.
     descends = (np.diff(judged) < 0).any() or (np.diff(judged[1:]) <= 0).any()
     if descends or judged[-1] > num:
         raise DataError(
@@ -517,10 +525,10 @@ def _check_values(arrays: Mapping[str, np.ndarray], path: Path) -> None:
 
 
 def _check_prompts(parts: Mapping[str, np.ndarray], prefix: str, path: Path) -> None:
-    """Raise ``DataError`` for a prompt without a goal, or for a best one with a goal that is no place.
+    """Raise ``DataError`` for a prompt without goals, or a best prompt with a NaN or huge goal.
 
-    Slots that are not used may hold anything. So may prompts that only acted, which nothing reads: with a
-    population of 2, CMA-ES ends at NaN after many episodes.
+    Unused slots may hold anything. So may the goals of prompts that only acted, which nothing reads: with a
+    population of 2, CMA-ES reaches NaN after many episodes.
     """
     goals, mask = parts.get("prompt.goals"), parts.get("prompt.mask")
     if mask is None:
@@ -531,7 +539,7 @@ def _check_prompts(parts: Mapping[str, np.ndarray], prefix: str, path: Path) -> 
         raise DataError(f"{path}: {prefix}prompt.mask leaves no goal at {place}; {ADAPT_AGAIN}")
     if goals is None or prefix == "choice.":
         return
-    wrong = mask[..., None] & ~(np.abs(goals) <= LARGEST)  # which NaN is neither
+    wrong = mask[..., None] & ~(np.abs(goals) <= LARGEST)  # also true for NaN
     if wrong.any():
         raise DataError(
             f"{path}: {prefix}prompt.goals holds {goals[wrong][0]:g} at "
@@ -540,7 +548,7 @@ def _check_prompts(parts: Mapping[str, np.ndarray], prefix: str, path: Path) -> 
 
 
 def _place(where: np.ndarray, axes: str) -> str:
-    """The first place where something is true, with its axes as letters, in a message."""
+    """The first position at which ``where`` is true, in words; ``axes`` are the letters of its axes."""
     named = zip(axes, np.argwhere(where)[0], strict=True)
     return ", ".join(f"{AXES[axis]} {int(number)}" for axis, number in named)
 
@@ -554,7 +562,7 @@ def _with_prefix(arrays: Mapping[str, Any], prefix: str) -> dict[str, Any]:
 
 
 def _expand(arrays: Mapping[str, np.ndarray], where: Path) -> Reached | None:
-    """Reached goals from their places in the table of different goals."""
+    """Reached goals from their indices into the table of unique goals."""
     found = [arrays[name] for name in REACHED if name in arrays]
     if not found:
         return None

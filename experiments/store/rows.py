@@ -1,6 +1,7 @@
-"""Adaptations in one table. Each row says what it is of: the tasks, the size, and the settings that differ
-from the defaults. Nothing here imports jax, except to ask a world about results of an older version, and no
-place that a file names is imported.
+"""Adaptations as the rows of a table, which state the tasks, the size, and all non-default settings.
+
+Nothing here imports jax, except to ask a world about results of an older version. A module:attribute that a
+file names is never imported.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from mgpo_jax.methods import METHODS, policy_kind
 from mgpo_jax.released import released_folder
 from mgpo_jax.schema import read_document
 
-PAPER_EPISODES = 100  # the paper's budget for one task
+PAPER_EPISODES = 100  # the paper's episode budget per task
 SHOWN = (
     "policy",
     "seed",
@@ -52,8 +53,11 @@ SHOWN = (
     "obs_noise",
     "action_noise",
     "stop_at",
-)  # settings that every method has
-STATED = {"seed", "eval_every"}  # may differ beside the paper's number, since the row states it
+)  # settings that all methods have
+STATED = {
+    "seed",
+    "eval_every",
+}  # may differ in a row with the paper's number, since the row states them
 
 
 class Row(NamedTuple):
@@ -62,13 +66,13 @@ class Row(NamedTuple):
     folder: str
     summary: Summary
     tasks: str
-    """``test`` (those of the world), ``validation`` or ``own`` (of a user)."""
+    """``test`` (the world's test tasks), ``validation`` or ``own`` (a user's tasks)."""
     settings: Mapping[str, str]
-    """Those that differ from the defaults."""
+    """The settings that differ from the defaults."""
 
     @property
     def like_the_paper(self) -> bool:
-        """Whether the paper's number may stand beside it."""
+        """Whether the row is comparable with the paper's number."""
         return (
             self.tasks == "test"
             and self.summary["num_episodes"] == PAPER_EPISODES
@@ -77,13 +81,13 @@ class Row(NamedTuple):
 
 
 def as_json(row: Row) -> dict[str, Any]:
-    """Everything that a row is made of, as JSON values."""
+    """All of a row as JSON values."""
     about = {"folder": row.folder, "tasks": row.tasks, "settings": dict(row.settings)}
     return {**about, **row.summary}
 
 
 def read_row(folder: Path) -> Row:
-    """Read what a table says of an adaptation.
+    """Read the row of an adaptation from its result folder.
 
     Raises:
       DataError: if a file is missing or damaged, or the files contradict each other.
@@ -95,7 +99,7 @@ def read_row(folder: Path) -> Row:
         raise DataError(
             f"{folder / CONFIG} and {SUMMARY} name different worlds or methods; {ADAPT_AGAIN}"
         )
-    # A place is not imported: what it is of stays unknown.
+    # A module:attribute is not imported, so its record stays unknown.
     world = WORLDS.find(summary["env"]) if summary["env"] in WORLDS.names() else None
     single = judged_once(config, world)
     check_against(folder / ARRAYS, summary, single, world)
@@ -112,10 +116,10 @@ def read_row(folder: Path) -> Row:
 
 
 def _shares_of_older(folder: Path, summary: Summary) -> list[tuple[float, int]] | None:
-    """p_k of single episodes of an older version, which kept no numbers of parts.
+    """p_k for results of an older version, which did not store the numbers of parts.
 
-    The world is asked for them, which needs jax, unless the returns cannot be shares of parts. Where what
-    the world needs is not installed, p_k are unknown.
+    The world computes them, which needs jax, unless the returns cannot be shares of parts. If the world's
+    dependencies are not installed, p_k are unknown.
     """
     if not (0 <= summary["initial_return"] <= 1 and 0 <= summary["final_return"] <= 1):
         return None
@@ -129,7 +133,7 @@ def _shares_of_older(folder: Path, summary: Summary) -> list[tuple[float, int]] 
 
 
 def _arrivals_of_older(folder: Path, world: World) -> dict[str, Any]:
-    """Success rate and SPL of an older version's results, which follow from what is there."""
+    """Success rate and SPL for results of an older version, computed from their arrays."""
     fields = {name: DECIDING[name] for name in ("eval_returns", "optimal_returns")}
     arrays = read_arrays(
         folder / ARRAYS, fields, dict.fromkeys("SNC", range(1, 2**31)), ADAPT_AGAIN
@@ -138,10 +142,9 @@ def _arrivals_of_older(folder: Path, world: World) -> dict[str, Any]:
 
 
 def kind_of_tasks(path: Path, config: Mapping[str, Any], world: World | None) -> str:
-    """What the tasks of an adaptation are.
+    """The kind of an adaptation's tasks: ``test``, ``validation`` or ``own``.
 
-    Where a world has released test tasks, only the very same ones are called so, whatever the settings
-    say.
+    If a world has released test tasks, only exactly these count as ``test``, whatever the settings say.
     """
     stated = "validation" if config.get("validation") else "own"
     released = released_folder(world) / TASKS if world else None
@@ -162,7 +165,7 @@ def _all_arrays(path: Path) -> dict[str, np.ndarray]:
 def changed_settings(
     config: Mapping[str, Any], summary: Summary, world: World | None
 ) -> dict[str, str]:
-    """The settings of an adaptation that differ from the defaults, as a table shows them."""
+    """The settings of an adaptation that differ from the defaults, as text for a table."""
     fields = {field.name: field.default for field in dataclasses.fields(AdaptConfig)}
     changed = {
         name: config[name] for name in SHOWN if config.get(name, fields[name]) != fields[name]
@@ -172,11 +175,11 @@ def changed_settings(
     if "policy" not in changed and sha256 not in (None, released):
         changed["policy"] = sha256[:12] if sha256 else ""
     changed |= _changed_hyper(config, method_of(summary), world)
-    return {shortened(name): _told(value) for name, value in changed.items()}
+    return {shortened(name): _format_setting(value) for name, value in changed.items()}
 
 
 def _released_sha256(world: World | None, kind: str, default: str | None) -> str | None:
-    """The hash of a world's released network of a kind; the default where there is none."""
+    """The hash of a world's released network of a kind; ``default`` if there is none."""
     place = released_folder(world, kind) / CONFIG if world else None
     if place is None or not place.is_file():
         return default
@@ -184,9 +187,9 @@ def _released_sha256(world: World | None, kind: str, default: str | None) -> str
 
 
 def _changed_hyper(config: Mapping[str, Any], method: str, world: World | None) -> dict[str, Any]:
-    """Hyper-parameters that differ from the method's defaults in a world; of a place, all that are set."""
+    """Hyper-parameters that differ from the method's defaults in a world; all of them if unregistered."""
     hyper = config.get("hyper")
-    if not isinstance(hyper, Mapping):  # the first version kept those of all methods together
+    if not isinstance(hyper, Mapping):  # the first version stored those of all methods together
         options = config.get("options")
         more = {name: config.get(name) for name in ("max_goals", "keep_rewarded")}
         hyper = {**options, **more} if isinstance(options, Mapping) else more
@@ -200,8 +203,8 @@ def _changed_hyper(config: Mapping[str, Any], method: str, world: World | None) 
     }
 
 
-def _told(value: Any) -> str:
-    """A setting as a table shows it."""
+def _format_setting(value: Any) -> str:
+    """The value of a setting as text for a table."""
     if isinstance(value, bool):
         return str(value).lower()
     return shortened(f"{value:g}" if isinstance(value, float) else str(value))
@@ -236,34 +239,35 @@ FURTHER: Mapping[str, tuple[str, Callable[[Summary], str]]] = {
         lambda summary: f"{100 * np.mean(_achieved(summary)):.1f} %",
     ),
 }
-"""Columns that only some worlds fill, by what stands above them: the entry of a summary that a cell needs,
-and the cell."""
+"""Optional columns by title: the entry of a summary that a cell needs, and a function that makes the
+cell."""
 
 
 def _achieved(summary: Summary) -> list[float]:
-    """Shares of the judged episodes that achieved each named goal under the optimized prompt."""
+    """The success rate of each named goal under the optimized prompt."""
     return [after for _, after in summary["achieved"].values()]
 
 
-def _further(name: str, summary: Summary) -> str:
-    """A cell of ``FURTHER``; empty where a summary has nothing to say."""
+def _further_cell(name: str, summary: Summary) -> str:
+    """A cell of a column of ``FURTHER``; empty if the summary lacks its entry."""
     needed, cell = FURTHER[name]
     return cell(summary) if needed in summary else ""
 
 
 def comparison(rows: Sequence[Row]) -> str:
-    """Adaptations beside the paper's Table 2, one row for each, in the order given.
+    """A Markdown table of adaptations, with the paper's final returns where they are comparable.
 
-    Where a row has p_k or what else some worlds say, there are columns for it, which stay empty in the rows
-    without.
+    The columns of ``FURTHER`` and of p_k only appear if a row fills them.
     """
-    further = [name for name in FURTHER if any(_further(name, row.summary) for row in rows)]
+    further = [name for name in FURTHER if any(_further_cell(name, row.summary) for row in rows)]
     num = max((len(row.summary.get("part_shares") or ()) for row in rows), default=0)
     head = (*HEAD, *further, *(f"p{k}" for k in range(1, num + 1)))
     return table(
         head,
         [
-            _cells(row) + [_further(name, row.summary) for name in further] + _share_cells(row, num)
+            _cells(row)
+            + [_further_cell(name, row.summary) for name in further]
+            + _share_cells(row, num)
             for row in rows
         ],
     )
@@ -291,12 +295,12 @@ def _cells(row: Row) -> list[str]:
         number(summary["optimal_return"]),
         number(summary["regret"]),
         number(summary["regret_after_40"]),
-        _share(summary["solved_optimally"], summary.get("unsolvable_tasks", 0)),
+        _solved_cell(summary["solved_optimally"], summary.get("unsolvable_tasks", 0)),
         paper_final(env, method) if row.like_the_paper else "",
     ]
 
 
-def _share(solved: float | None, num_unsolvable: int) -> str:
+def _solved_cell(solved: float | None, num_unsolvable: int) -> str:
     if solved is None:
         return ""
     mark = f" ({num_unsolvable} tasks unsolvable)" if num_unsolvable else ""

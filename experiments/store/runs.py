@@ -1,9 +1,9 @@
 """The folder of a pre-training run: when a run may start there, and what a resumed run must agree on.
 
-It holds ``config.json`` (the settings), ``meta.json`` (how and with what it was made), ``init`` (a copy of
-the policy that it started from, if any), ``metrics.jsonl``, ``checkpoints`` and, when it is finished,
-``policy`` and ``training.png``. A run has begun where there is a ``config.json``: a start writes it last.
-Nothing here imports jax.
+It contains ``config.json`` (the settings), ``meta.json`` (provenance), ``init`` (a copy of the policy that
+the run started from, if any), ``metrics.jsonl``, ``checkpoints`` and, when the run is finished, ``policy``
+and ``training.png``. A start writes ``config.json`` last, so a run has begun if that exists. Nothing here
+imports jax.
 """
 
 from __future__ import annotations
@@ -45,29 +45,29 @@ from mgpo_jax.schema import Json, read_document
 
 CONFIG, META, CHECKPOINTS, POLICY = "config.json", "meta.json", "checkpoints", "policy"
 PICTURE, WEIGHTS, GOALS = "training.png", "weights.npz", "goals.npz"
-OLD_PARTIAL = "config.json.partial"  # what older versions were writing when they were killed
-PROLONGED = "prolonged_after"  # the entry of META with the steps after which a run took more
-ROOM = 32 << 20  # bytes that must be free before a training starts: a few small checkpoints
+OLD_PARTIAL = "config.json.partial"  # left behind by older versions that were killed
+PROLONGED = "prolonged_after"  # entry of META: the steps at which a finished run was prolonged
+ROOM = 32 << 20  # bytes that must be free before a training starts, enough for small checkpoints
 
 
 def has_begun(folder: Path) -> bool:
-    """Whether a folder holds a run; one that was killed before it began is no run."""
+    """Whether a folder contains a run that has begun; one that was killed before that does not count."""
     return os.path.isfile(folder / CONFIG)
 
 
 def is_finished(folder: Path) -> bool:
     """Whether a run has trained to its end and written its policy."""
-    # The picture is the last thing that is written.
+    # The picture is written last.
     names = (f"{POLICY}/{CONFIG}", f"{POLICY}/{WEIGHTS}", PICTURE)
     return all(os.path.isfile(folder / name) for name in names)
 
 
 def check_start(config: PretrainConfig) -> None:
-    """Check that a run can be started, or resumed where its settings say so.
+    """Check that a run can be started, or resumed if its settings say so.
 
     Raises:
-      UsageError: if its folder is taken, or nothing can be written there.
-      DataError: if there is a file where its checkpoints should be.
+      UsageError: if its folder is taken or cannot be written to, or the settings of a resumed run differ.
+      DataError: if there is a file in place of the folder of checkpoints.
     """
     folder = config.folder
     if has_begun(folder):
@@ -88,15 +88,15 @@ def check_start(config: PretrainConfig) -> None:
 
 
 def _holds_nothing(folder: Path) -> bool:
-    """Whether a folder holds only what a run leaves behind that was killed before it began."""
+    """Whether a folder contains only leftovers of a run that was killed before it began."""
     own = {LOCK, META, OLD_PARTIAL}
     if (folder / META).is_file() and _holds_only(folder / INIT, {WEIGHTS, CONFIG, GOALS}):
-        own.add(INIT)  # which is written after META
+        own.add(INIT)  # it is written after META
     return _holds_only(folder, own)
 
 
 def _holds_only(folder: Path, names: Set[str]) -> bool:
-    """Whether a folder holds nothing but files of some names, and what a killed process was writing."""
+    """Whether a folder contains nothing but entries with some names, and temporary files."""
     return folder.is_dir() and all(
         path.name in names or path.name.startswith(TEMPORARY) for path in folder.iterdir()
     )
@@ -107,11 +107,11 @@ def identity(config: PretrainConfig, dataset_sha256: str, init_sha256: str = "")
 
     Args:
       config: settings of the run.
-      dataset_sha256: the hash of its dataset.
-      init_sha256: that of the weights that it starts from; empty for random ones.
+      dataset_sha256: hash of its dataset.
+      init_sha256: hash of the weights that it starts from; empty for random weights.
     """
     usual = training_settings(PretrainConfig(env=DEFAULT_WORLD))
-    # Those that have their defaults are left out, so that settings which are added later change nothing.
+    # Defaults are left out, so that adding a setting later does not change the hash.
     settings = {k: v for k, v in training_settings(config).items() if v != usual[k]}
     hashes = [dataset_sha256, init_sha256] if init_sha256 else [dataset_sha256]
     text = json.dumps([settings, *hashes], sort_keys=True)
@@ -119,14 +119,14 @@ def identity(config: PretrainConfig, dataset_sha256: str, init_sha256: str = "")
 
 
 def begin(config: PretrainConfig, meta: dict[str, Any]) -> None:
-    """Note what a new run is, with a copy of the policy that it starts from.
+    """Write the settings and provenance of a new run, and a copy of the policy that it starts from.
 
     Raises:
       DataError: if that policy was replaced since it was read.
     """
     (config.folder / OLD_PARTIAL).unlink(missing_ok=True)
     write_json(config.folder / META, meta)
-    if config.init is None:  # what a start from a policy has left that was killed
+    if config.init is None:  # remove what a killed start from a policy left behind
         shutil.rmtree(config.folder / INIT, ignore_errors=True)
     keep_initial(config, meta)
     write_json(config.folder / CONFIG, config)
@@ -135,10 +135,10 @@ def begin(config: PretrainConfig, meta: dict[str, Any]) -> None:
 def keep_initial(config: PretrainConfig, meta: Mapping[str, Any]) -> None:
     """Copy the policy that a run starts from into its folder, unless it was read from there.
 
-    A run can then be resumed when that policy has been replaced, as a release does, and anywhere.
+    The run can then be resumed even if that policy is replaced, as by a release, or the run is moved.
 
     Raises:
-      DataError: if the policy was replaced since it was read, or a file is where the copy should be.
+      DataError: if the policy was replaced since it was read, or a file is in place of the copy.
     """
     if config.init is None or (source := initial_folder(config)) == config.folder / INIT:
         return
@@ -149,7 +149,7 @@ def keep_initial(config: PretrainConfig, meta: Mapping[str, Any]) -> None:
     remove_unfinished(place)
     for name in (WEIGHTS, CONFIG, GOALS):
         if name == GOALS and not (source / name).is_file():
-            continue  # an older policy kept no goals
+            continue  # older policies have no goals
         with written(place / name) as partial:
             shutil.copyfile(source / name, partial)
     if hash_file(place / WEIGHTS) != meta["init_sha256"]:
@@ -157,7 +157,7 @@ def keep_initial(config: PretrainConfig, meta: Mapping[str, Any]) -> None:
 
 
 def steps_trained(folder: Path) -> int:
-    """How many gradient steps the policy of a finished run has taken; 0 where there is none.
+    """The number of gradient steps that a finished run has taken; 0 if it is not finished.
 
     Raises:
       DataError: if the config of the policy is damaged.
@@ -172,7 +172,7 @@ def steps_trained(folder: Path) -> int:
 
 
 def prolonged(config: PretrainConfig) -> int | None:
-    """The number of steps that a finished run had, if it is resumed to take more; None elsewhere."""
+    """The steps of a finished run that is resumed to take more; None for any other run."""
     folder = config.folder
     if not (goes_on(config) and (trained := steps_trained(folder))):
         return None
@@ -180,14 +180,14 @@ def prolonged(config: PretrainConfig) -> int | None:
 
 
 def kept_policy(folder: Path, trained: int) -> Path:
-    """Where the policy of a run is kept that takes more steps than it was trained for."""
+    """The folder that keeps the policy after ``trained`` steps when a finished run is prolonged."""
     return folder / f"{POLICY}-{trained}"
 
 
 def note_prolonged(config: PretrainConfig, trained: int) -> None:
-    """Note that a finished run takes more steps, and keep a copy of the policy that it has.
+    """Record that a finished run takes more steps, and keep a copy of its present policy.
 
-    The new settings are written last, so that a process that is killed before can begin again.
+    The new settings are written last, so that the prolongation can be repeated if the process is killed.
     """
     kept = kept_policy(config.folder, trained)
     if not kept.exists():
@@ -200,16 +200,16 @@ def note_prolonged(config: PretrainConfig, trained: int) -> None:
 
 
 def identities(config: PretrainConfig, dataset_sha256: str, init_sha256: str = "") -> list[str]:
-    """The hashes that checkpoints of a run may have: its own, and those from before it was prolonged."""
+    """The identities that checkpoints of a run may have: its own, and those before it was prolonged."""
     before = _saved_meta(config.folder).get(PROLONGED, []) if goes_on(config) else []
     runs = [replace(config, train=replace(config.train, steps=steps)) for steps in before]
     return [identity(one, dataset_sha256, init_sha256) for one in (config, *runs)]
 
 
 def check_settings(config: PretrainConfig) -> None:
-    """Raise ``UsageError`` if a run that is resumed was started with other settings or other weights.
+    """Raise ``UsageError`` if a resumed run was started with other settings or other weights.
 
-    A finished run may take more steps.
+    Only the steps of a finished run may be raised.
     """
     folder = config.folder
     saved = saved_pretraining(folder / CONFIG)
@@ -227,9 +227,9 @@ def check_settings(config: PretrainConfig) -> None:
 
 
 def starts_elsewhere(saved: PretrainConfig, config: PretrainConfig) -> bool:
-    """Whether a run that is resumed was started from other weights than its settings say now.
+    """Whether a resumed run was started from other weights than its settings now say.
 
-    A place that was named at the start as well is not looked at: a run has a copy of what was there.
+    If the path is the same as at the start, its content does not matter, since the run has a copy.
     """
     if saved.init == config.init:
         return False
@@ -239,9 +239,9 @@ def starts_elsewhere(saved: PretrainConfig, config: PretrainConfig) -> bool:
 
 
 def check_same(config: PretrainConfig, meta: dict[str, Any]) -> None:
-    """Check that a run which is resumed learns from the same dataset as before.
+    """Check that a resumed run is trained on the same dataset as before.
 
-    A line on stderr says so where other devices or versions may change the last bits of the result.
+    Other devices or versions, which may change the last bits of the result, are reported on stderr.
 
     Raises:
       DataError: if it was started on another dataset.
@@ -266,10 +266,10 @@ def check_same(config: PretrainConfig, meta: dict[str, Any]) -> None:
 
 
 def check_same_start(config: PretrainConfig, init_sha256: str) -> None:
-    """Check that a run which is resumed, if it has begun, started from the weights with a hash.
+    """Check that a resumed run started from the weights with a given hash.
 
     Raises:
-      DataError: if it started from others.
+      DataError: if it started from other weights.
     """
     before = _saved_meta(config.folder).get("init_sha256") if goes_on(config) else None
     if before not in (None, init_sha256):
@@ -281,7 +281,7 @@ def check_same_start(config: PretrainConfig, init_sha256: str) -> None:
 
 
 def _saved_meta(folder: Path) -> dict[str, Any]:
-    """How and with what a run was made; empty if that file is gone."""
+    """The ``meta.json`` of a run; empty if the file does not exist."""
     if not (folder / META).is_file():
         return {}
     mend = f"remove {folder / META}, and it is written again"
@@ -289,7 +289,7 @@ def _saved_meta(folder: Path) -> dict[str, Any]:
 
 
 def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """What differs between two sets of settings, in words; empty if nothing does."""
+    """The differences between two sets of settings, in words; empty if there are none."""
     return "; ".join(
         f"{name} {shown(before.get(name))} -> {shown(now.get(name))}"
         for name in sorted(before.keys() | now.keys())
@@ -298,16 +298,16 @@ def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
 
 
 def say_what_differs(saved: dict[str, Any], now: dict[str, Any], what: str) -> None:
-    """Say on stderr if work was begun with another number of devices or with other versions.
+    """Report on stderr if work was begun with other devices or other versions.
 
     Args:
       saved: the ``meta.json`` of the work.
-      now: that of this process.
-      what: the work, for the message.
+      now: provenance of this process.
+      what: what the message calls the work.
     """
     differs = []
     if isinstance(saved.get("devices"), list):
-        devices, devices_now = _counted(saved["devices"]), _counted(now["devices"])
+        devices, devices_now = _count_devices(saved["devices"]), _count_devices(now["devices"])
         if devices != devices_now:
             differs.append(f"{devices} (now {devices_now})")
     if isinstance(saved.get("versions"), dict):
@@ -322,7 +322,7 @@ def say_what_differs(saved: dict[str, Any], now: dict[str, Any], what: str) -> N
         print(text, file=sys.stderr)
 
 
-def _counted(devices: Sequence[Any]) -> str:
-    """Devices by their kind, such as ``2 x TFRT_CPU``."""
+def _count_devices(devices: Sequence[Any]) -> str:
+    """The number of devices of each kind, such as ``2 x TFRT_CPU``."""
     kinds = Counter(printable(re.sub(r"[_:]\d+$", "", str(device))) for device in devices)
     return ", ".join(f"{num} x {kind}" for kind, num in sorted(kinds.items()))

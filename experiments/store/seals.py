@@ -1,7 +1,7 @@
-"""Pictures and tables that a command may replace: those that a command wrote and nobody has changed.
+"""Seals of output files, so that commands only replace files that they wrote and nobody has changed.
 
-Such a file carries a seal, a comment with the hash of everything else in it. A file without a seal, or
-whose seal is not that of its content, belongs to somebody else and is never overwritten.
+A seal is a comment in the file with the hash of everything else in it. A file without a seal, or with a
+seal that does not match its content, belongs to the user and is never overwritten.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ def _comment(content: bytes) -> tuple[bytes, bytes]:
 
 
 def _png(content: bytes) -> tuple[bytes, bytes]:
-    """A text chunk before the last chunk, which always has 12 bytes."""
+    """A text chunk, to insert before the last chunk, which always has 12 bytes."""
     chunk = b"tEXt" + b"Comment\0" + _note(content)
     size, check = struct.pack(">I", len(chunk) - 4), struct.pack(">I", zlib.crc32(chunk))
     return size + chunk + check, content[-12:]
 
 
 def _gif(content: bytes) -> tuple[bytes, bytes]:
-    """A comment before the last byte, which ends a GIF."""
+    """A comment, to insert before the last byte, which ends a GIF."""
     note = _note(content)
     return b"\x21\xfe" + bytes([len(note)]) + note + b"\0", content[-1:]
 
@@ -46,29 +46,30 @@ _SEALS: dict[str, Callable[[bytes], tuple[bytes, bytes]]] = {
     ".png": _png,
     ".gif": _gif,
 }
-"""By suffix: the seal of some content, and the end of the content that has to stand after it."""
+"""By suffix: a function that returns the seal of a content, and the part of the content that must follow
+it."""
 
 
 def sealed(content: bytes, suffix: str) -> bytes:
-    """The content of a file with its seal."""
+    """The content of a file with its seal inserted."""
     seal, end = _SEALS[suffix](content)
     return content[: len(content) - len(end)] + seal + end
 
 
 def is_sealed(content: bytes, suffix: str) -> bool:
-    """Whether the content of a file is as a command wrote it."""
+    """Whether the content of a file has a valid seal, and so is unchanged since a command wrote it."""
     seal, end = _SEALS[suffix](content)
-    at = len(content) - len(end) - len(seal)  # all seals of one kind have the same length
+    at = len(content) - len(end) - len(seal)  # all seals of a suffix have the same length
     return at >= 0 and sealed(content[:at] + end, suffix) == content
 
 
 def is_foreign(path: Path) -> bool:
-    """Whether something is there that no command wrote as it is."""
+    """Whether a path exists and is not a file with a valid seal."""
     return os.path.lexists(path) and not _is_ours(path)
 
 
 def check_replaceable(paths: Iterable[Path], *ways_out: str) -> None:
-    """Raise ``UsageError`` with the ways out if files are there that no command wrote as they are."""
+    """Raise ``UsageError``, with the ways out in the message, if writing would replace foreign files."""
     foreign = [str(path) for path in paths if is_foreign(path)]
     if foreign:
         more = f" and {len(foreign) - 3} more" if len(foreign) > 3 else ""
@@ -83,7 +84,7 @@ def _is_ours(path: Path) -> bool:
 
 
 def write_sealed(path: Path, save: Callable[[Path], object]) -> None:
-    """Write a picture or a table by ``save``, with its seal, whole or not at all."""
+    """Write a file with ``save`` and seal it; the file is replaced atomically."""
     with written(path) as partial:
         save(partial)
         partial.write_bytes(sealed(partial.read_bytes(), path.suffix))

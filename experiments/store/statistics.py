@@ -1,8 +1,8 @@
 """Aggregates of scores over tasks and seeds, and comparisons of two sets of scores.
 
-Intervals are those of Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical
-Precipice" (2021): seeds are drawn anew within each task, a stratum, and the interval lies between two
-percentiles of what is computed from them. One seed cannot be drawn anew, so that there is no interval.
+Confidence intervals follow Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical
+Precipice" (2021): percentile intervals of a stratified bootstrap, which resamples the seeds within each
+task. A single seed cannot be resampled, so it has no interval.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from envs.registry import StepCost
     from experiments.store.results import Results
 
-MOST_PARTS = 20  # of a task, that are told apart
-WHOLE = 1e-3  # a number of parts may be off by this, since returns are sums of rounded rewards
+MOST_PARTS = 20  # maximum number of parts of a task that are reported
+WHOLE = 1e-3  # tolerance of a number of parts, since returns are sums of rounded rewards
 
 
 class Interval(NamedTuple):
-    """A point estimate with a confidence interval, whose ends are None where there is none."""
+    """A point estimate with a confidence interval; ``low`` and ``high`` are None if there is none."""
 
     value: float
     low: float | None = None
@@ -38,8 +38,7 @@ class Interval(NamedTuple):
 def interquartile_mean(scores: np.ndarray, axis: int = -1) -> np.ndarray:
     """Mean of the middle half of the scores along an axis.
 
-    Where a quarter of the scores is no whole number, the scores at its edge count by the share of
-    them that lies inside.
+    If the number of scores is not a multiple of four, the scores at the edges count in part.
     """
     ordered = np.sort(scores, axis=axis)
     num = ordered.shape[axis]
@@ -52,7 +51,7 @@ def interquartile_mean(scores: np.ndarray, axis: int = -1) -> np.ndarray:
 def stratified_bootstrap_iqm(
     scores: np.ndarray, confidence: float = 0.95, num_resamples: int = 2000, seed: int = 0
 ) -> Interval:
-    """IQM over seeds and tasks of scores [S, N], with its interval."""
+    """The IQM of scores [S, N] over seeds and tasks, with its interval."""
     rng = np.random.default_rng(seed)
     iqms = [interquartile_mean(_resampled(scores, rng).ravel()) for _ in range(num_resamples)]
     value = float(interquartile_mean(scores.ravel()))
@@ -60,11 +59,11 @@ def stratified_bootstrap_iqm(
 
 
 class SeedSpread(NamedTuple):
-    """Mean over tasks and seeds, and the standard deviation over seeds of the mean over tasks."""
+    """The mean over tasks and seeds, and the standard deviation over seeds of the mean over tasks."""
 
     mean: float
     std: float | None
-    """None for one seed."""
+    """None with a single seed."""
 
     def __str__(self) -> str:
         return f"{self.mean:.3f}" if self.std is None else f"{self.mean:.3f} ± {self.std:.3f}"
@@ -77,27 +76,27 @@ def seed_spread(scores: np.ndarray) -> SeedSpread:
 
 
 class PartShare(NamedTuple):
-    """p_k, for a number k of parts."""
+    """p_k: how often the first k parts of a task were done in order."""
 
     share: float
-    """Of the tasks and seeds with at least k parts, the share in which k were done in order."""
+    """Share of the tasks and seeds with at least k parts in which the first k were done in order."""
     num: int
-    """How many tasks and seeds have at least k parts."""
+    """Number of tasks and seeds with at least k parts."""
 
     def __str__(self) -> str:
         return f"{self.share:.2f} ({self.num})"
 
 
 def part_shares(returns: np.ndarray, num_parts: np.ndarray) -> list[PartShare] | None:
-    """p_1, p_2, .. up to the most parts of a task, ``MOST_PARTS`` at most.
+    """p_1, p_2, .. up to the largest number of parts of a task, and at most ``MOST_PARTS``.
 
     Args:
-      returns: [S, N] returns of single episodes. A mean of several does not tell how many parts were done
-        in how many of them.
-      num_parts: [N] numbers of equally rewarded parts of the tasks. Those without any (0) do not count.
+      returns: [S, N] returns of single episodes. (A mean over episodes does not say how many parts were
+        done in each.)
+      num_parts: [N] numbers of equally rewarded parts of the tasks; tasks without parts (0) do not count.
 
     Returns:
-      None if no task has parts, or if a return is no whole number of them.
+      The shares, or None if no task has parts, or a return is not a whole number of parts.
     """
     having = num_parts > 0
     if not having.any():
@@ -113,23 +112,23 @@ def part_shares(returns: np.ndarray, num_parts: np.ndarray) -> list[PartShare] |
 
 
 class Arrivals(NamedTuple):
-    """How often and how straight single episodes arrived at their goals, over tasks and seeds."""
+    """How often and how directly episodes arrived at their goals, over tasks and seeds."""
 
     success_rate: float
     """Share of the episodes that arrived."""
     spl: float
     """Success weighted by path length (Anderson et al., "On Evaluation of Embodied Navigation Agents",
-    2018): the mean of shortest over walked steps, and 0 for an episode that did not arrive. Every step
-    counts as walked, those against a wall, too."""
+    2018): the mean ratio of the shortest path to the steps taken, which is 0 for an episode that did not
+    arrive. Every step counts, including those against a wall."""
 
 
 def arrivals(returns: np.ndarray, optimum: np.ndarray, cost: StepCost) -> Arrivals:
-    """Success rate and SPL.
+    """The success rate and SPL of episodes.
 
     Args:
       returns: [S, N] returns of single episodes.
-      optimum: [N] best returns that can be had.
-      cost: how the world pays them.
+      optimum: [N] optimal returns.
+      cost: the world's cost of a step, from which numbers of steps follow.
     """
     steps, shortest = cost.num_steps(returns), cost.num_steps(optimum)
     arrived = np.isfinite(steps)
@@ -144,8 +143,8 @@ class Comparison(NamedTuple):
     difference: Interval
     """Mean of the first minus mean of the second."""
     improvement: Interval
-    """Probability that, on a random task, a random seed of the first beats one of the second; ties count
-    half."""
+    """Probability that, on a random task, a random seed of the first beats a random seed of the second;
+    ties count half."""
 
 
 def paired_difference(
@@ -157,10 +156,10 @@ def paired_difference(
 ) -> Comparison:
     """Compare scores [S, N] on the same N tasks; the numbers of seeds may differ.
 
-    Tasks are paired and stay as they are: the intervals say how the outcome would vary with other seeds on
-    these tasks, not on other tasks. The seeds of both are drawn anew within each task. With few seeds a
-    bootstrap is too narrow: of intervals of 95 %, those of 3 seeds hold the truth about 88 times in 100,
-    those of 10 seeds about 95 times. A set with a single seed has no intervals.
+    The bootstrap resamples the seeds of both sets within each task, and keeps the tasks. So the intervals
+    say how the result would vary with other seeds on these tasks, not on other tasks. With few seeds a
+    bootstrap is too narrow: the 95 % intervals of 3 seeds cover the truth in about 88 of 100 cases, those
+    of 10 seeds in about 95. If either set has a single seed, there are no intervals.
 
     Raises:
       ValueError: if the scores are of different numbers of tasks.
@@ -182,14 +181,14 @@ def paired_difference(
 
 
 class Profile(NamedTuple):
-    """Shares of tasks and seeds whose score reaches each of K thresholds, with an interval at each."""
+    """A performance profile: the shares of tasks and seeds whose score reaches each of K thresholds."""
 
     share: np.ndarray
-    """[K]."""
+    """[K] shares."""
     low: np.ndarray | None
-    """[K]; None with one seed."""
+    """[K] lower ends of their intervals; None with a single seed."""
     high: np.ndarray | None
-    """[K]; None with one seed."""
+    """[K] upper ends; None with a single seed."""
 
 
 def performance_profile(
@@ -199,9 +198,10 @@ def performance_profile(
     num_resamples: int = 1000,
     seed: int = 0,
 ) -> Profile:
-    """Shares of the scores [S, N] that are at least each of the thresholds [K].
+    """The performance profile of scores [S, N] at thresholds [K].
 
-    The intervals hold for each threshold by itself. Seeds are drawn anew within each task.
+    The intervals are pointwise: each holds for its own threshold. The bootstrap resamples seeds within each
+    task.
     """
 
     def shares(drawn: np.ndarray) -> np.ndarray:
@@ -226,8 +226,8 @@ def gain_over_tasks(
 ) -> Interval:
     """Mean of scores a minus mean of scores b, [S, N] each, on the same N tasks.
 
-    Tasks are paired and drawn anew, with the means over their seeds: the interval says how the difference
-    would vary on other tasks. One task has no interval.
+    The bootstrap resamples the tasks, with their means over seeds. So the interval says how the difference
+    would vary on other tasks. With a single task there is no interval.
     """
     each = a.mean(axis=0, dtype=np.float64) - b.mean(axis=0, dtype=np.float64)
     rng = np.random.default_rng(seed)
@@ -254,20 +254,20 @@ def _difference(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def _chance_to_beat(a: np.ndarray, b: np.ndarray) -> float:
-    """Share of pairs of seeds in which a is above b, over all tasks; ties count half."""
+    """Share of the pairs of seeds, over all tasks, in which a is above b; ties count half."""
     above, equal = a[:, None] > b[None], a[:, None] == b[None]
     return float(np.mean(above + 0.5 * equal))
 
 
 def _resampled(scores: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Scores [S, N] whose seeds are drawn anew within each task."""
+    """Scores [S, N] with the seeds resampled within each task."""
     return scores[rng.integers(len(scores), size=scores.shape), np.arange(scores.shape[1])]
 
 
 def _percentile_interval(
     value: float, resamples: Sequence[Any] | np.ndarray, confidence: float, num_drawn: int
 ) -> Interval:
-    """The interval of what was drawn anew; there is none where that is a single seed or task."""
+    """The percentile interval of resamples; there is none if only one seed or task was resampled."""
     if num_drawn < 2:
         return Interval(value)
     tail = 50 * (1 - confidence)

@@ -1,4 +1,4 @@
-"""The numbers of an adaptation that tables show. Nothing here imports jax before it has to."""
+"""The summary of an adaptation: the numbers that tables show. jax is only imported where it is needed."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ from mgpo_jax.schema import STRICT, Sha256, read_document
 if TYPE_CHECKING:
     from experiments.store.results import Results
 
-MIDWAY = 40  # episodes after which the regret is also given
-BEHIND_NOISE = 10  # least number of episodes of a judgement behind noise
+MIDWAY = 40  # episodes after which the regret is also reported
+BEHIND_NOISE = 10  # minimum number of episodes of a judgement under noise
 SOLVED = 1e-4  # a smaller regret counts as an optimal solution
-CLOSE = 1e-4  # numbers of a summary and of the arrays may differ by this, relative to their size
+CLOSE = 1e-4  # tolerance, absolute and relative, between a summary and the arrays it follows from
 ADAPT_AGAIN = "adapt again with `python -m experiments.adapt`"
 DECIDING = {
     "returns": ArrayField(("S", "N", "E"), "numbers"),
@@ -49,7 +49,7 @@ DECIDING = {
     "optimal_returns": ArrayField(("N",), "numbers", required=False),
     "num_parts": ArrayField(("N",), "integers", required=False, low=0),
 }
-"""The arrays of ``results.npz`` that a summary follows from."""
+"""Schemas of the arrays of ``results.npz`` that determine a summary."""
 PLACE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", re.ASCII)  # module:attribute
 
 Label = Annotated[str, MaxLen(200)]
@@ -63,30 +63,33 @@ PartShares = Annotated[list[tuple[Fraction, Extent]], MinLen(1), MaxLen(MOST_PAR
 
 @with_config(STRICT)
 class Fresh(TypedDict):
-    """What sampled episodes outside of the budget say of a search, in which the best return is luck."""
+    """The result of a search by sampled episodes outside of the budget, in stochastic worlds.
+
+    There, the best return within the search is a matter of luck.
+    """
 
     episodes: Extent
-    """How many a judged return is the mean of."""
+    """Number of episodes that a judged return averages."""
     gain: float
     """``final_return`` minus ``initial_return``."""
     gain_95: tuple[float, float] | None
-    """Its interval over tasks (``statistics.gain_over_tasks``); None for one task."""
+    """Its 95 % interval over tasks (``statistics.gain_over_tasks``); None for a single task."""
 
 
 @with_config(STRICT)
 class Summary(TypedDict):
-    """``summary.json``. What needs an unknown optimum, or more than one seed, is None."""
+    """``summary.json``. Entries that need an unknown optimum or more seeds than there are, are None."""
 
     env: Label
     optimizer: Label
-    """The method, as older versions call it."""
+    """The method, as older versions called it."""
     method: NotRequired[Label]
     policy_sha256: NotRequired[Sha256]
     num_tasks: Extent
     num_seeds: Extent
     num_episodes: Extent
     unsolvable_tasks: NotRequired[Tally]
-    """Tasks that nobody can solve within the horizon."""
+    """Number of tasks that cannot be solved within the horizon."""
     initial_return: float
     final_return: float
     final_return_std_over_seeds: Amount | None
@@ -98,39 +101,39 @@ class Summary(TypedDict):
     regret_after_40: float | None
     solved_optimally: Fraction | None
     part_shares: NotRequired[PartShares | None]
-    """p_1, p_2, .. of the optimized prompt, each with the number of tasks and seeds that it is of
-    (``statistics.part_shares``). None where tasks are not rewarded part by part, and where a judged return
-    is the mean of several episodes: only that mean is kept, which does not tell the parts of each."""
+    """p_1, p_2, .. under the optimized prompt, each with the number of tasks and seeds that it is based on
+    (``statistics.part_shares``). None if tasks are not rewarded part by part, or if a judged return is the
+    mean of several episodes, which does not say how many parts were done in each."""
     success_rate: NotRequired[Fraction]
-    """Of worlds whose task is to arrive in few steps (``World.step_cost``): the share of the judged
-    episodes under the optimized prompt that did. It is counted in single episodes, as the next is."""
+    """In worlds where the task is to arrive in few steps (``World.step_cost``), and single episodes are
+    judged: the share of them that arrived under the optimized prompt."""
     spl: NotRequired[Fraction]
-    """Success weighted by path length (``statistics.Arrivals``)."""
+    """Success weighted by path length (``statistics.Arrivals``), under the same conditions."""
     episodes_used: NotRequired[Amount]
-    """With ``--stop-at``: episodes until a search ended, on average."""
+    """With ``--stop-at``: mean number of episodes of a search."""
     prompts_scored: NotRequired[Amount]
-    """Of methods that ask the policy about prompts without spending an episode: how many in a search."""
+    """For methods that score prompts with the policy instead of an episode: mean number per search."""
     failed_episodes: Tally
     best_episode_return: float
-    """Return of the best single episode of the search, a matter of luck in worlds of chance."""
+    """Mean return of the best single episode of each search; a matter of luck in stochastic worlds."""
     fresh: NotRequired[Fresh]
-    """Only of worlds whose policies are judged by sampled actions."""
+    """Only in worlds whose policies are judged by sampled actions."""
     achieved: NotRequired[Shares]
-    """In worlds with named goals: by the name of each, the share of the judged episodes that achieved it
-    under the initial and under the optimized prompt."""
+    """In worlds with named goals: the success rate of each goal under the initial and under the optimized
+    prompt."""
     cpu_seconds: Amount
     episodes_per_cpu_second: Amount
 
 
 def method_of(summary: Summary) -> str:
-    """Name or place of the method, also in a summary of an older version."""
+    """The method's name or module:attribute, also in a summary of an older version."""
     return summary.get("method", summary["optimizer"])
 
 
 def summarize(
     results: Results, *, policy_sha256: str, num_episodes: int, num_failed: int, cpu_seconds: float
 ) -> dict[str, Any]:
-    """The numbers of ``summary.json``."""
+    """Compute the ``summary.json`` of results."""
     solvable = solvable_tasks(results)
     optimum = results.optimal_returns if results.optimum_known else None
     final, single = results.eval_returns[:, :, -1], judged_once(results.config, results.world)
@@ -140,23 +143,23 @@ def summarize(
         "method": results.method,
         "policy_sha256": policy_sha256,
         "unsolvable_tasks": int((~solvable).sum()),
-        **_of_returns(results.returns),
-        **_of_judgements(results.eval_returns),
-        **_against_optimum(results.eval_episodes, results.eval_returns, optimum, solvable),
+        **_return_entries(results.returns),
+        **_judgement_entries(results.eval_returns),
+        **_optimum_entries(results.eval_episodes, results.eval_returns, optimum, solvable),
         "part_shares": part_shares(final, results.num_parts) if single else None,
         **of_arrivals(results.eval_returns, optimum, results.world if single else None),
-        **_of_sampling(results),
-        **_of_named_goals(results),
-        **_of_scoring(results),
-        **_of_stopping(results),
+        **_sampling_entries(results),
+        **_named_goal_entries(results),
+        **_scoring_entries(results),
+        **_stopping_entries(results),
         "failed_episodes": num_failed,
         "cpu_seconds": cpu_seconds,
         "episodes_per_cpu_second": num_episodes / cpu_seconds,
     }
 
 
-def _of_returns(returns: np.ndarray) -> dict[str, Any]:
-    """What follows from the returns [S, N, E] of the search."""
+def _return_entries(returns: np.ndarray) -> dict[str, Any]:
+    """The entries that follow from the returns [S, N, E] of the search."""
     return {
         "num_tasks": returns.shape[1],
         "num_seeds": returns.shape[0],
@@ -165,8 +168,8 @@ def _of_returns(returns: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _of_judgements(eval_returns: np.ndarray) -> dict[str, Any]:
-    """What follows from the judged returns [S, N, C] alone."""
+def _judgement_entries(eval_returns: np.ndarray) -> dict[str, Any]:
+    """The entries that follow from the judged returns [S, N, C] alone."""
     final = eval_returns[:, :, -1]
     iqm, spread = stratified_bootstrap_iqm(final), seed_spread(final)
     return {
@@ -181,33 +184,33 @@ def _of_judgements(eval_returns: np.ndarray) -> dict[str, Any]:
 def of_arrivals(
     eval_returns: np.ndarray, optimum: np.ndarray | None, world: World | None
 ) -> dict[str, Any]:
-    """The entries ``success_rate`` and ``spl`` of a summary, in worlds that have them; elsewhere nothing.
+    """The entries ``success_rate`` and ``spl``; empty in worlds without them.
 
     Args:
       eval_returns: [S, N, C] judged returns of single episodes.
-      optimum: [N], if it is known.
-      world: None where the judged returns are means of several episodes.
+      optimum: [N] optimal returns, if they are known.
+      world: the world; None if the judged returns are means of several episodes.
     """
     if world is None or world.step_cost is None or optimum is None:
         return {}
     return arrivals(eval_returns[:, :, -1], optimum, world.step_cost)._asdict()
 
 
-def _of_scoring(results: Results) -> dict[str, Any]:
-    """The entry ``prompts_scored`` of a summary, of methods that score prompts without an episode."""
+def _scoring_entries(results: Results) -> dict[str, Any]:
+    """The entry ``prompts_scored``; empty for methods that do not score prompts."""
     if results.num_scored is None:
         return {}
     return {"prompts_scored": float(results.num_scored[:, :, -1].mean())}
 
 
-def _of_stopping(results: Results) -> dict[str, Any]:
-    """The entry ``episodes_used`` of a summary, of searches that may end early."""
+def _stopping_entries(results: Results) -> dict[str, Any]:
+    """The entry ``episodes_used``; empty for searches that cannot stop early."""
     used = results.episodes_used
     return {} if used is None else {"episodes_used": float(used.mean())}
 
 
-def _of_sampling(results: Results) -> dict[str, Any]:
-    """The entry ``fresh`` of a summary, in worlds that judge by sampled actions; elsewhere nothing."""
+def _sampling_entries(results: Results) -> dict[str, Any]:
+    """The entry ``fresh``; empty in worlds that do not judge by sampled actions."""
     judged = results.world.judged
     if judged.mode != "sample":
         return {}
@@ -216,13 +219,13 @@ def _of_sampling(results: Results) -> dict[str, Any]:
 
 
 def _gain(eval_returns: np.ndarray) -> dict[str, Any]:
-    """How much better the last of the judged returns [S, N, C] are than the first."""
+    """The gain of the last over the first of the judged returns [S, N, C], with its interval."""
     gain = gain_over_tasks(eval_returns[:, :, -1], eval_returns[:, :, 0])
     return {"gain": gain.value, "gain_95": None if gain.low is None else [gain.low, gain.high]}
 
 
-def _of_named_goals(results: Results) -> dict[str, Any]:
-    """The entry ``achieved`` of a summary, in worlds whose goals have names; elsewhere nothing."""
+def _named_goal_entries(results: Results) -> dict[str, Any]:
+    """The entry ``achieved``; empty in worlds whose goals have no names."""
     if results.eval_achieved is None:
         return {}
     shares = _first_and_last(results.eval_achieved).tolist()
@@ -230,21 +233,21 @@ def _of_named_goals(results: Results) -> dict[str, Any]:
 
 
 def _first_and_last(achieved: np.ndarray) -> np.ndarray:
-    """[M, 2]: from shares [S, N, C, M], those of the first and of the last judgement."""
+    """The mean success rates [M, 2] in the first and the last judgement, from shares [S, N, C, M]."""
     return achieved[:, :, [0, -1]].mean(axis=(0, 1)).T
 
 
 def judged_once(config: Mapping[str, Any], world: World | None) -> bool | None:
-    """Whether a judged return is of a single episode; None if only the world knows, which is not known."""
+    """Whether a judged return is of a single episode; None if that depends on an unknown world."""
     episodes = judged_episodes(config, world)
     return None if episodes is None else episodes == 1
 
 
 def judged_episodes(config: Mapping[str, Any], world: World | None) -> int | None:
-    """How many episodes a judged return is the mean of; None if only the world knows, which is not known.
+    """The number of episodes that a judged return averages; None if that depends on an unknown world.
 
-    The settings or the world's record say it. Behind noise it is at least ``BEHIND_NOISE``: the record does
-    not know of that noise.
+    The settings or the world's record determine it. Under noise, which the record does not consider, it is
+    at least ``BEHIND_NOISE``.
     """
     if (episodes := config.get("eval_episodes")) is not None or world is None:
         return episodes
@@ -253,22 +256,26 @@ def judged_episodes(config: Mapping[str, Any], world: World | None) -> int | Non
 
 
 def solvable_tasks(results: Results) -> np.ndarray:
-    """[N]: whether anyone could solve each task within the horizon."""
+    """[N] whether each task can be solved within the horizon."""
     import jax
 
     solvable = results.world.make().solvable
     return np.asarray(jax.jit(jax.vmap(solvable))(results.task_set))
 
 
-def _against_optimum(
+def _optimum_entries(
     episodes: np.ndarray,
     eval_returns: np.ndarray,
     optimum: np.ndarray | None,
     solvable: np.ndarray | bool = True,
 ) -> dict[str, Any]:
-    """What follows from the returns [S, N, C] judged after some episodes [C] and the optimum [N].
+    """The entries that compare judged returns with the optimum; None if that is unknown.
 
-    ``solvable`` [N] says which tasks can count as solved.
+    Args:
+      episodes: [C] numbers of episodes after which the returns were judged.
+      eval_returns: [S, N, C] judged returns.
+      optimum: [N] optimal returns.
+      solvable: [N] which tasks can count as solved.
     """
     names = (
         "optimal_return",
@@ -295,10 +302,10 @@ def _against_optimum(
 
 
 def read_summary(folder: Path) -> Summary:
-    """The numbers that tables show, of a result folder.
+    """Read the summary of a result folder.
 
     Raises:
-      DataError: if there is no ``summary.json``, or a number is missing or cannot be.
+      DataError: if there is no ``summary.json``, or a number is missing or impossible.
     """
     path = Path(folder) / SUMMARY
     summary: Summary = read_document(path, Summary, ADAPT_AGAIN)
@@ -311,7 +318,7 @@ def read_summary(folder: Path) -> Summary:
 
 
 def _check_name(registry: Registry, name: str, path: Path) -> None:
-    """Raise ``DataError`` for a name that is neither known nor a place, of which nothing is imported."""
+    """Raise ``DataError`` for a name that is neither known nor a module:attribute; imports nothing."""
     if PLACE.fullmatch(name):
         return
     try:
@@ -325,17 +332,17 @@ def _check_name(registry: Registry, name: str, path: Path) -> None:
 def check_against(
     path: Path, summary: Summary, single: bool | None, world: World | None = None
 ) -> None:
-    """Raise ``DataError`` if a summary does not follow from the returns in ``results.npz``.
+    """Raise ``DataError`` if a summary does not follow from the arrays in ``results.npz``.
 
-    Only their world knows which tasks nobody can solve. The summary says how many there are, and its share
-    solved must be one that so many of them allow.
+    Only the world knows which tasks are unsolvable. The summary gives their number, so its share of solved
+    tasks must be consistent with that.
 
     Args:
-      path: ``results.npz``.
-      summary: what is to follow from it.
-      single: whether the judged returns are of single episodes (``judged_once``). Where that is not known,
-        the summary may leave out its p_k.
-      world: whose summary it is, where that is known.
+      path: path of ``results.npz``.
+      summary: the summary to check.
+      single: whether the judged returns are of single episodes (``judged_once``); if that is unknown, the
+        summary may lack p_k.
+      world: the world, if it is known.
     """
     arrays = read_arrays(path, DECIDING, dict.fromkeys("SNECR", range(1, 2**31)), ADAPT_AGAIN)
     judged, optimum = arrays["eval_returns"], arrays.get("optimal_returns")
@@ -344,9 +351,9 @@ def check_against(
     num_unsolvable = min(found["unsolvable_tasks"], num_tasks)
     expected = {
         "unsolvable_tasks": num_unsolvable,
-        **_of_returns(arrays["returns"]),
-        **_of_judgements(judged),
-        **_against_optimum(arrays["eval_episodes"], judged, optimum),
+        **_return_entries(arrays["returns"]),
+        **_judgement_entries(judged),
+        **_optimum_entries(arrays["eval_episodes"], judged, optimum),
     }
     most, solved = expected["solved_optimally"], found["solved_optimally"]
     if most is not None and solved is not None:
@@ -374,8 +381,8 @@ def check_against(
     for name, value in expected.items():
         if not _agree(found[name], value):
             raise DataError(
-                f"{path.with_name(SUMMARY)}: {name} is {_told(found[name])}, by {path.name} it is "
-                f"{_told(value)}; {ADAPT_AGAIN}"
+                f"{path.with_name(SUMMARY)}: {name} is {_format_value(found[name])}, by {path.name} it is "
+                f"{_format_value(value)}; {ADAPT_AGAIN}"
             )
 
 
@@ -386,14 +393,14 @@ def _agree(found: Any, expected: Any) -> bool:
     return same_shape and bool(np.allclose(found, expected, rtol=CLOSE, atol=CLOSE))
 
 
-def _told(value: Any) -> str:
+def _format_value(value: Any) -> str:
     if value is None:
         return "unknown"
     return ", ".join(f"{part:.6g}" for part in np.ravel(value))
 
 
-def _rows_of_sampling(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The printed lines on sampled episodes, as label and text; none in worlds that judge greedily."""
+def _sampling_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The printed rows on sampled episodes, as label and text; empty in worlds that judge greedily."""
     if not (fresh := summary.get("fresh")):
         return []
     gain = Interval(fresh["gain"], *(fresh["gain_95"] or ()))
@@ -411,14 +418,17 @@ def _rows_of_sampling(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def _rows_of_named_goals(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The printed lines on named goals, as label and text; none in worlds without names."""
+def _named_goal_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The printed rows on named goals, as label and text; empty in worlds without names."""
     if not (achieved := summary.get("achieved")):
         return []
     first, last = zip(*achieved.values(), strict=True)
     return [
         ("score", f"{mean_log_success(last):.2f} (initially {mean_log_success(first):.2f})"),
-        ("goals achieved", f"{_of_all(last)} of {len(last)} (initially {_of_all(first)})"),
+        (
+            "goals achieved",
+            f"{_mean_percent(last)} of {len(last)} (initially {_mean_percent(first)})",
+        ),
         *(
             (f"  {name}", f"{_percent(after)} (initially {_percent(before)})")
             for name, (before, after) in achieved.items()
@@ -426,7 +436,7 @@ def _rows_of_named_goals(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def _of_all(shares: Sequence[float]) -> str:
+def _mean_percent(shares: Sequence[float]) -> str:
     return _percent(float(np.mean(shares)))
 
 
@@ -435,7 +445,7 @@ def _percent(share: float) -> str:
 
 
 def printed(summary: Mapping[str, Any]) -> str:
-    """The summary as it is printed after an adaptation."""
+    """The summary as a block of text, which is printed after an adaptation."""
     low, high = summary["final_return_iqm_95"] or (None, None)
     final = SeedSpread(summary["final_return"], summary["final_return_std_over_seeds"])
     more = " (mean ± std over seeds)" if final.std is not None else ""
@@ -458,7 +468,7 @@ def printed(summary: Mapping[str, Any]) -> str:
     if shares := summary.get("part_shares"):
         rows.append(("parts in order", "share with the first k done (tasks x seeds that have k)"))
         rows += [(f"  p{k}", str(PartShare(*pair))) for k, pair in enumerate(shares, 1)]
-    rows += _rows_of_sampling(summary) + _rows_of_named_goals(summary)
+    rows += _sampling_rows(summary) + _named_goal_rows(summary)
     if unsolvable := summary.get("unsolvable_tasks"):
         rows.append(
             (

@@ -1,4 +1,4 @@
-"""Tables of commands: one function lays them out, for the terminal and for Markdown."""
+"""The layout of all tables that commands print or write, for the terminal and for Markdown."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from envs.errors import printable
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], markdown: bool = True) -> str:
-    """Rows of cells under a head: as Markdown, or in columns of equal width.
+    """Lay out rows of cells under a head, as Markdown or in aligned columns.
 
-    Whatever a cell holds, it stays one cell on one line.
+    Whatever a cell contains, it stays a single cell on one line.
     """
     lines = [[printable(cell) for cell in line] for line in (head, *rows)]
     if markdown:
@@ -23,18 +23,18 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], markdown: bool = T
 
 
 def aligned(cells: Sequence[str], widths: Sequence[int]) -> str:
-    """One line of a table, its cells as wide as their columns."""
+    """One line of a table, with cells padded to the widths of their columns."""
     return " ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)).rstrip()
 
 
 def block(title: str, rows: Sequence[tuple[str, str]]) -> str:
-    """Names and values under a title."""
+    """Names and values in two columns under a title."""
     title = printable(title)
     return "\n".join([title, "-" * len(title), table(("", ""), rows, markdown=False)])
 
 
 def shortened(text: str, longest: int = 60) -> str:
-    """The text, or its beginning and its end where it is long."""
+    """The text, with its middle replaced by dots if it is too long."""
     if len(text) <= longest:
         return text
     half = (longest - 3) // 2
@@ -42,5 +42,5 @@ def shortened(text: str, longest: int = 60) -> str:
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """A number, or nothing where it is unknown."""
+    """A formatted number; empty if it is unknown."""
     return "" if value is None else f"{value:.{digits}f}"

@@ -1,7 +1,7 @@
-"""Long work towards a new folder: what is finished is kept, and a killed command goes on with ``--resume``.
+"""Long work that produces a new folder, and that ``--resume`` continues after an interruption.
 
-While ``NAME`` is being made there is a folder ``NAME.partial`` with the finished pieces, which only one
-process may work in.
+While ``NAME`` is being made, finished pieces are kept in a folder ``NAME.partial``, in which only one
+process may work at a time.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ class _Begun(BaseModel):
 
     settings: dict[str, Json]
     meta: dict[str, Json]
-    """Of the process that began it."""
+    """Provenance of the process that began the work."""
     resumed: list[Json] = []
-    """Of those that went on with it."""
+    """Provenance of the processes that resumed it."""
 
 
 class Work(NamedTuple):
-    """What long work needs."""
+    """What a piece of long work needs."""
 
     place: Path
-    """Where to write the result."""
+    """Folder to write the result to."""
     journal: Journal
-    """Where finished pieces are kept."""
+    """The finished pieces."""
     meta: dict[str, Any]
-    """How and with what the result is made, for its ``meta.json``."""
+    """Provenance of the result, for its ``meta.json``."""
 
 
 @contextmanager
@@ -58,21 +58,21 @@ def long_work(
     wait: bool = False,
     go_on: str = "continue with --resume",
 ) -> Iterator[Work]:
-    """A place to write the result to, and a journal of finished pieces.
+    """Provide a place to write the result to, and a journal of finished pieces.
 
-    Of several processes that work together only process 0 has the place, where it writes the result.
+    If several processes work together, only process 0 gets the place, and it writes the result.
 
     Args:
       folder: what the place becomes when the block ends.
-      settings: everything that decides about the result.
-      meta: how and with what this process works, of ``provenance``.
-      resume: whether to go on with what a stopped process has finished.
-      wait: wait for another process that makes the same folder.
-      go_on: what continues the work after a stop, for messages.
+      settings: everything that determines the result.
+      meta: ``provenance`` of this process.
+      resume: whether to continue unfinished work.
+      wait: whether to wait for another process that makes the same folder.
+      go_on: how to continue after an interruption, for messages.
 
     Raises:
       DataError: if ``folder`` exists, or another process makes it.
-      UsageError: if there is unfinished work that ``resume`` does not ask for, or it is of other settings.
+      UsageError: if there is unfinished work, and ``resume`` is not set or the settings differ.
     """
     if not processes.is_first():
         yield Work(Path(), Journal(), {})
@@ -91,7 +91,15 @@ def long_work(
 def open_journal(
     pieces: Path, settings: Mapping[str, Any], meta: Mapping[str, Any]
 ) -> tuple[Journal, dict[str, Any]]:
-    """The journal of work that is begun, or of unfinished work, and how and with what all of it is made.
+    """Open the journal of new or unfinished work.
+
+    Args:
+      pieces: folder of the journal.
+      settings: everything that determines the result.
+      meta: ``provenance`` of this process.
+
+    Returns:
+      The journal, and the provenance of the whole work for its ``meta.json``.
 
     Raises:
       UsageError: if unfinished work was begun with other settings.
