@@ -1,1 +1,1 @@
-"""Worlds made of environments that others wrote; docs/guides/own-gymnasium-world.md walks through them."""
+"""Worlds made from gymnasium environments of other packages; see docs/guides/own-gymnasium-world.md."""

@@ -14,11 +14,11 @@ from envs.live import Moment
 gymnasium.register_envs(minigrid)
 LEFT, RIGHT, FORWARD, TOGGLE = 0, 1, 2, 5
 WALL, DOOR, GOAL, CLOSED = 2, 4, 8, 1  # codes of Minigrid
-SIZE = 24.0  # of the grid, in cells
+SIZE = 24.0  # width and height of the grid, in cells
 
 
 def make():
-    """Minigrid also picks up and drops things, which these rooms have none of; the other actions remain."""
+    """Keeps the useful actions: Minigrid can also pick up and drop things, but these rooms have none."""
     env = gymnasium.make("MiniGrid-MultiRoom-N4-S5-v1", max_episode_steps=60)
     return gymnasium.wrappers.TransformAction(
         env, lambda action: (LEFT, RIGHT, FORWARD, TOGGLE)[action], gymnasium.spaces.Discrete(4)
@@ -30,7 +30,7 @@ def place(cell):
 
 
 def observe(moment: Moment):
-    """The cell ahead, the direction and the own place: of Minigrid's view of 7 x 7 cells, one is kept."""
+    """The cell ahead (of Minigrid's view of 7 x 7 cells), the agent's direction and its position."""
     kind, _, state = moment.obs["image"][3, 5]
     seen = [kind == WALL, kind == GOAL, kind == DOOR, kind == DOOR and state == CLOSED]
     direction = np.eye(4)[moment.obs["direction"]]
@@ -39,7 +39,7 @@ def observe(moment: Moment):
 
 
 def planner(env, rng):
-    """Walks a shortest way to the goal and opens the doors on it; one action in five is random."""
+    """Follows a shortest path to the goal and opens the doors on it; one action in five is random."""
     grid = env.unwrapped.grid
 
     def passable(cell):

@@ -1,4 +1,4 @@
-"""What a step of the examples costs on one thread and on two: ``python -m examples.host_speed``."""
+"""Measure a step of the example worlds on one and on two threads: ``python -m examples.host_speed``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ EPISODES, STEPS = 16, 10
 
 
 def measure(name: str, num_threads: int) -> tuple[float, float]:
-    """Milliseconds of a step by the clock and of processor time, in a batch of ``EPISODES``."""
+    """The wall time and the CPU time of a step in milliseconds, in a batch of ``EPISODES``."""
     described = importlib.import_module(f"examples.{name}").WORLD.make().described
     described = replace(described, threads=num_threads)
     pool, space = described.pool, described.to_program(described.action_space.sample())

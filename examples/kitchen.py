@@ -1,6 +1,6 @@
-"""FrankaKitchen of gymnasium-robotics, where subtasks pay in an order that is not told.
+"""FrankaKitchen of gymnasium-robotics, with rewards for subtasks completed in a hidden order.
 
-The released policy of our own kitchen acts in it: it sees the same 59 numbers.
+The released policy of our kitchen can act in it, since its observations have the same 59 numbers.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from envs.gymnasium_world import GymnasiumWorld
 from envs.kitchen.env import NONE, SUBTASKS
 from envs.kitchen.official import franka_kitchen, num_in_turn
 
-HORIZON = 500  # that of the released policy
+HORIZON = 500  # as the released policy was trained with
 
 
 class Ordered(gymnasium.Wrapper):
-    """Pays 1/n for a subtask of the task that is completed in its turn; all else is FrankaKitchen."""
+    """FrankaKitchen with a reward of 1/n for each of the task's n subtasks completed in its turn."""
 
     def reset(self, *, seed=None, options=None):
         obs, info = self.env.reset(seed=seed)
@@ -34,12 +34,12 @@ class Ordered(gymnasium.Wrapper):
 
 
 def marked(names):
-    """The subtasks of these names as a vector of zeros and ones."""
+    """The named subtasks as a boolean vector over all subtasks."""
     return np.isin(SUBTASKS, list(names))
 
 
 def draw_order(rng):
-    """Three of the five subtasks in a random order."""
+    """Draw three of the five subtasks in random order."""
     return {"order": np.append(rng.permutation(len(SUBTASKS))[:3], [NONE, NONE])}
 
 

@@ -1,4 +1,4 @@
-"""PointMaze of gymnasium-robotics: push a ball through a maze with forces, to a place that is told."""
+"""PointMaze of gymnasium-robotics: push a ball through a maze by forces, to a given position."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def wanderer(env, rng):
     maze = env.unwrapped.maze
     free = {tuple(cell) for cell in np.argwhere(np.array(maze.maze_map) != 1)}
     start = tuple(maze.cell_xy_to_rowcol(env.unwrapped.point_env.data.qpos[:2]))
-    way = [start, start]  # the cell it comes from, and the one it rolls to
+    way = [start, start]  # the cell that the ball comes from, and the one that it rolls to
 
     def act(moment):
         place, speed = moment.obs["observation"][:2], moment.obs["observation"][2:]

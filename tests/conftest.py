@@ -1,4 +1,4 @@
-"""Shared fixtures. jaxtyping's shapes are enforced on every call while tests run."""
+"""Shared fixtures and settings of all tests. jaxtyping's shapes are enforced on every call."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 TWO_DEVICES = "--xla_force_host_platform_device_count=2"
-"""So that what is spread over devices is tested as such."""
-# Most of the time of a test is compiling a program that runs for milliseconds. Without optimization, and
-# with the older emitters of loops, that takes a quarter of the time. With --all, all compile as for users.
+"""Flag of XLA that makes tests run on two devices, so that sharding is tested."""
+# Most of the time of a test goes into compiling a program that runs for milliseconds. Without optimization,
+# and with the older loop emitters, this takes a quarter of the time. With --all, programs are optimized.
 QUICK = (
     f"{TWO_DEVICES} --xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
     + " --xla_cpu_use_fusion_emitters=false" * jaxlib.__version__.startswith("0.10.")
 )
-"""Flags of XLA with which compiling takes little time. Versions from 0.11 on have no older emitters, and
-abort at a flag that they do not know."""
+"""Flags of XLA for fast compilation. Versions from 0.11 on have no older emitters, and abort at an unknown
+flag."""
 MIN_COMPILE_SECONDS = 0.05
-"""Programs that compile faster are not kept: writing and reading them takes time, too."""
+"""Programs that compile faster are not cached, since writing and reading them takes time, too."""
 
 jaxtyping.install_import_hook(["mgpo_jax", "envs"], "beartype.beartype")
 jax.config.update("jax_numpy_rank_promotion", "allow")
@@ -40,7 +40,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "slow: runs only with --all")
     config.addinivalue_line("markers", "optimized: runs with programs that compile as for users")
-    # XLA reads its flags when jax first needs a device, which is after this.
+    # XLA reads its flags when jax first needs a device, which happens later.
     os.environ.setdefault("XLA_FLAGS", TWO_DEVICES if config.getoption("--all") else QUICK)
 
 
@@ -53,10 +53,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
-    """Run a test in a process of its own where its programs must be optimized and are not here.
+    """Run a test marked ``optimized`` in its own process, if this process compiles without optimization.
 
-    XLA reads its flags once in a process. These tests compare bits of different programs, or look at what
-    many steps make of small differences.
+    XLA reads its flags once per process. These tests compare different programs bit for bit, or are
+    sensitive to small differences that grow over many steps.
     """
     quick = os.environ["XLA_FLAGS"].startswith(QUICK)  # envs.compiler may have added to it
     if "optimized" not in pyfuncitem.keywords or not quick:
@@ -77,7 +77,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
 
 
 def require_kitchen() -> None:
-    """Skip the module that calls this where the kitchen cannot run."""
+    """Skip the calling test module if the kitchen's dependencies are missing."""
     from envs.kitchen import import_mujoco
 
     try:
@@ -88,20 +88,20 @@ def require_kitchen() -> None:
 
 @pytest.fixture(autouse=True, scope="session")
 def _compiled_once(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Keep programs from one test to the next, and for all workers of a run, as commands keep them."""
+    """Share compiled programs between all tests and workers of a run, with jax's persistent cache."""
     base = tmp_path_factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "compiled"
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", MIN_COMPILE_SECONDS)
-    compilation_cache.reset_cache()  # some modules compile while they are imported
+    compilation_cache.reset_cache()  # some modules compile on import
 
 
-MOST_MAPPINGS = 15_000  # of a process's memory; Linux ends a program that wants more than 65,530
+MOST_MAPPINGS = 15_000  # memory mappings of this process; Linux allows 65,530
 
 
 @pytest.fixture(autouse=True, scope="module")
 def _few_programs() -> Iterator[None]:
-    """Forget compiled programs between modules when there are many: each maps memory of its own."""
+    """Drop compiled programs between modules when there are many, since each has memory mappings."""
     yield
     mappings = Path("/proc/self/maps")
     if mappings.exists() and mappings.read_bytes().count(b"\n") > MOST_MAPPINGS:

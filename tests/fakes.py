@@ -1,4 +1,4 @@
-"""Results and players of episodes that figures can be drawn from, made by hand."""
+"""Fake results, and functions that run episodes, for tests of figures."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ from mgpo_jax.rollout import Query, rollout
 
 @dataclass
 class FakeResults:
-    """What figures read of results; ``found[i]`` maps episodes to the best prompt since then on task i."""
+    """The part of ``Results`` that figures read.
+
+    ``found[i]`` maps numbers of episodes to the best prompt on task i from then on.
+    """
 
     tasks: Sequence[Any]
     task_goals: np.ndarray
@@ -29,7 +32,7 @@ class FakeResults:
     num_episodes: int
     max_goals: int
     method: str = "ucb"
-    reached: None = None  # what a search has seen is not drawn
+    reached: None = None  # no figure of what a search has seen
 
     @property
     def returns(self) -> np.ndarray:
@@ -51,7 +54,7 @@ class FakeResults:
 
 
 def player(env: Environment, policy: Policy) -> Callable[..., Episode]:
-    """Plays episodes of a policy."""
+    """A function that runs episodes of a policy."""
 
     @jax.jit
     def run(keys: jax.Array, task: Any, query: Query) -> Episode:

@@ -1,4 +1,4 @@
-"""Results made by hand, of a world of two tiny mazes, and their files."""
+"""Handmade results in a world of two tiny mazes, and their files."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Named(Wrapper):
 LUCKY = replace(
     TINY, make=lambda: Named(ENV), judged=Judgement(mode="sample", episodes=4), num_test_tasks=2
 )
-"""The same, judged by sampled actions and with names for its goals."""
+"""The same world, but judged by sampled actions, and with named goals."""
 
 
 def made_results(method: str = "ucb", shift: float = 0.0, **changes: Any) -> Results:
@@ -89,7 +89,7 @@ def made_results(method: str = "ucb", shift: float = 0.0, **changes: Any) -> Res
 
 
 def save_format_1(folder: Path, results: Results) -> Path:
-    """Results as the first version of the project wrote them: no actions, and names of their own."""
+    """Save results in format 1, which has no actions and other names."""
     folder.mkdir(parents=True)
     arrays = {f"choice.{name}": array for name, array in results.choices.items()}
     arrays |= {f"best.{name}": array for name, array in results.best.items() if name != "greedy"}

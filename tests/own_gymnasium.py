@@ -10,7 +10,7 @@ from envs.gymnasium_world import GymnasiumWorld
 
 
 class Plane(gymnasium.Env):
-    """A point in a square that walks to a place; actions are steps of at most 0.5 in both directions."""
+    """A point walks to a goal in a square; actions are steps of limited size in both directions."""
 
     action_space = Box(np.float32([-0.5, -0.25]), np.float32([0.5, 0.25]), dtype=np.float32)
     observation_space = Dict(
@@ -38,7 +38,7 @@ class Plane(gymnasium.Env):
 
 
 class Broken(Plane):
-    """A plane that cannot be moved in."""
+    """A plane in which every step raises an error."""
 
     def step(self, action):
         raise RuntimeError("the motor is off")

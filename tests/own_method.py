@@ -1,4 +1,4 @@
-"""A method of a user: acts under prompts drawn from the last episode, and keeps the luckiest."""
+"""A user's own method: draws prompts from the last episode, and keeps the luckiest."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""A world of a user: nine cells in a line, and two doors to open in an order that is not told."""
+"""A user's own world: nine cells in a line, and two doors to open in a hidden order."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CELLS, STAY = 9, 1  # action 0 goes to the left, 2 to the right
 
 
 class Doors(NamedTuple):
-    """Where a walk begins, and the cells of the two doors in the order in which they open."""
+    """A task: the cell where a walk starts, and the cells of the two doors in the order to open them."""
 
     start: Int[Array, "*batch"]
     order: Int[Array, "*batch 2"]
@@ -32,7 +32,7 @@ class Walk(NamedTuple):
 
 @dataclass(frozen=True)
 class Line(Environment):
-    """A door opens when it is reached in its turn, and pays half of the return."""
+    """A door opens when it is reached in its turn, for a reward of 1/2."""
 
     @property
     def spec(self) -> EnvSpec:
@@ -79,7 +79,7 @@ class Line(Environment):
 
 
 def knowing(weights: tuple) -> Agent:
-    """Walks to the doors in their order."""
+    """An agent that knows the order and walks to the doors."""
 
     def proceed(key: PRNGKeyArray, memory: tuple, state: Walk, timestep: TimeStep) -> tuple:
         door = state.task.order[jnp.minimum(state.num_open, 1)]

@@ -1,4 +1,4 @@
-"""Runs the pages' JavaScript outside of a browser, and what JAX says of the same episodes."""
+"""Run the pages' JavaScript outside of a browser, and the same episodes in JAX, for comparison."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Change = Callable[[str], str]
 
 
 def run_js(world: World, data: dict[str, Any], change: Change = lambda source: source) -> Any:
-    """What ``check`` in ``parity.js`` finds in data of one world; ``change`` damages the source first."""
+    """The result of ``check`` in ``parity.js`` on data of a world; ``change`` can damage the source."""
     bundle = Bundle()
     script = page_of(world).script
     assert script is not None
@@ -60,24 +60,24 @@ def run_js(world: World, data: dict[str, Any], change: Change = lambda source: s
 
 
 def halved(policy: LoadedPolicy) -> LoadedPolicy:
-    """The policy with the weights that a page has: rounded to half precision, as floats."""
+    """The policy with the weights of a page: rounded to half precision, but stored as float32."""
     halves = jax.tree.map(lambda leaf: leaf.astype(jnp.float16).astype(jnp.float32), policy.params)
     return policy._replace(params=halves)
 
 
 @dataclass(frozen=True)
 class Greedy:
-    """Greedy episodes of a policy in JAX, and what the page needs to play them again."""
+    """Greedy episodes of a policy in JAX, and the data that the page needs to replay them."""
 
     data: dict[str, Any]
     episodes: Episode
-    """With a leading axis."""
+    """The episodes, leaves ``[N, ..]``."""
     logits: np.ndarray
-    """``[N, T, A]``, of which the first ``length`` rows of each are real."""
+    """``[N, T, A]`` logits; only the first ``length`` rows of an episode are valid."""
 
 
 def played(world: World, num: int, prompts: int, stride: int = 1) -> Greedy:
-    """Greedy episodes under ``prompts`` random prompts on each of ``num`` test tasks, with their logits."""
+    """Run greedy episodes under ``prompts`` random prompts on each of ``num`` test tasks."""
     env, policy = world.make(), halved(load_policy(world))
     network, config = GoalTransformer(policy.config), policy.config
     tasks = jax.tree.map(lambda leaf: leaf[: num * stride : stride], test_tasks(world))
@@ -87,7 +87,7 @@ def played(world: World, num: int, prompts: int, stride: int = 1) -> Greedy:
     key_first, key_prompt, key_run = jax.vmap(lambda key: jax.random.split(key, 3))(keys.ravel()).T
     goals = jax.vmap(env.task_goal)(each)
     slots = config.max_prompt_length
-    # One program for both, since whether an episode is greedy is data.
+    # One program serves both, since ``greedy`` is data.
     act = jax.jit(jax.vmap(lambda key, task, query: rollout(key, env, policy.policy, task, query)))
     first = jax.vmap(lambda goal: single_goal(goal, slots))(goals)
     explored = act(key_first, each, Query(first, jnp.zeros(len(goals), bool)))
@@ -122,9 +122,9 @@ def played(world: World, num: int, prompts: int, stride: int = 1) -> Greedy:
 
 
 def differences(greedy: Greedy, found: Any) -> tuple[np.ndarray, list[bool]]:
-    """The largest difference of logits in each episode, and whether the page's own greedy path is JAX's.
+    """The largest difference of logits in each episode, and whether the page's greedy path equals JAX's.
 
-    Where two actions are tied within 1e-3 the paths may part.
+    The paths may part where two actions are tied within 1e-3.
     """
     largest, same = [], []
     lengths = greedy.episodes.trajectory.length
@@ -144,7 +144,7 @@ def differences(greedy: Greedy, found: Any) -> tuple[np.ndarray, list[bool]]:
 def searches(
     world: World, which: Sequence[int], num_episodes: int
 ) -> tuple[dict[str, Any], list[Any]]:
-    """UCB on some test tasks in JAX: all its random numbers, and its prompts and returns."""
+    """Run UCB on some test tasks in JAX; returns all its random numbers, and its prompts and returns."""
     env, policy = world.make(), halved(load_policy(world))
     spec, slots = env.spec, policy.config.max_prompt_length
     space = SearchSpace(
@@ -196,7 +196,7 @@ def searches(
 
 
 def _draws(key_ask: jax.Array, key_run: jax.Array, env: Any, slots: int) -> dict[str, jax.Array]:
-    """The random numbers of one round, from its keys: ``sample_prompt``, ``act`` and ``run_episode``."""
+    """The random numbers that sampling a prompt and running an episode draw from the keys of a round."""
     _, key_prompt = jax.random.split(key_ask)
     key_count, key_index = jax.random.split(key_prompt)
     bound = jnp.arange(slots + 1)

@@ -1,4 +1,4 @@
-"""Acting step by step in a world that somebody else steps: as in the episode loop, or a clear error."""
+"""``Actor``: the same actions as the episode loop in a world that the caller steps, or a clear error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Adaptation: pieces against the whole, lanes against single runs, one compilation, any kind of adapter."""
+"""Adaptation: segments against whole runs, lanes against single runs, one compilation, any adapter."""
 
 from __future__ import annotations
 

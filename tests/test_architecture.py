@@ -1,4 +1,4 @@
-"""The house rules, read from the source: imports only go down, and generic code knows no world."""
+"""Rules of the architecture, checked on the source: imports only go down, generic code names no world."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The bench counts the work that the network does, and its command runs to the end."""
+"""The bench: its count of FLOP against the network's work, and the command from start to end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bitboards against plain arrays and networkx."""
+"""Bitboards: operations and shortest paths against plain arrays and networkx."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A world beside its official program, and the noise of that: what commands say and write of it."""
+"""``experiments.check`` and ``--obs-noise official``: a world against its official program."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Training checkpoints: what is saved comes back, what is broken says so."""
+"""Training checkpoints: round trips, and clear errors for damage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command lines: errors that help, nothing overwritten, an interrupted run that goes on."""
+"""The commands: helpful errors, no file overwritten, and interrupted runs that continue."""
 
 from __future__ import annotations
 

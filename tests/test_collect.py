@@ -1,4 +1,4 @@
-"""Collection: what is not worth keeping is tried again."""
+"""Collection: demonstrations that are not kept are tried again."""
 
 from __future__ import annotations
 

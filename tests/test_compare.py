@@ -1,4 +1,4 @@
-"""Paired comparison of adaptations, on published results."""
+"""``experiments.compare``: paired comparisons of published results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a world computes for a lane does not depend on how many lanes there are."""
+"""The results of a lane do not depend on the number of lanes (a fault of XLA is avoided)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A shell completes the words of ``mgpo`` by the script that ``mgpo completion`` prints."""
+"""Shell completion: the scripts that ``mgpo completion`` prints."""
 
 from __future__ import annotations
 

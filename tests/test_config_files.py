@@ -1,4 +1,4 @@
-"""``--config``: the settings of a run where no flag is given; ``--quiet`` and ``--json``."""
+"""``--config``, which takes defaults from the settings of a run; ``--quiet`` and ``--json``."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""The learners of the baselines on CartPole and Pendulum of gymnasium, where good returns are well known.
+"""The learners of the baselines on gymnasium's CartPole and Pendulum, where good returns are well known.
 
-Those of PTGM and SPiRL stand alone here, one decision a step: Q-learning without a prior, and the soft
-actor-critic whose skills are the actions, under a wide prior that makes its divergence an entropy.
-PPO and REINFORCE finetune a small Transformer that has learned nothing yet.
+The learners of PTGM and SPiRL are tested on their own, with one decision per step: Q-learning without a
+prior, and a soft actor-critic whose skills are the actions, with a wide prior that turns its divergence
+into an entropy. PPO and REINFORCE finetune a small untrained Transformer.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The world of Crafter: its start, tasks, observations, chance, pictures, and a missing package.
+"""The world Crafter: initial states, tasks, observations, randomness, pictures, and a missing package.
 
 The rules themselves are compared with the Python program in tests/test_crafter_official.py.
 """

@@ -1,4 +1,4 @@
-"""The demonstrators of Crafter: on hand-made maps, against a search in Python, and blind to the unseen."""
+"""The demonstrators of Crafter: on handmade maps, against a search in Python, blind to unseen cells."""
 
 from __future__ import annotations
 

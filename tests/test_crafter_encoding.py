@@ -1,4 +1,4 @@
-"""The encoder that embeds Crafter's picture without drawing it, and a dense layer on the drawn picture."""
+"""The encoder that embeds Crafter's picture without drawing it, against a dense layer on the picture."""
 
 from __future__ import annotations
 

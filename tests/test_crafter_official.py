@@ -1,4 +1,4 @@
-"""Crafter against the Python program that it follows: the same worlds, acted in side by side."""
+"""Crafter against the official Python program: the same worlds, stepped side by side."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Datasets: files and their corruptions, gathering, slices and the stream of batches."""
+"""Datasets: files and damage to them, gathering, slices and the stream of batches."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""One command on two real processes of this machine: the same results, stops, deaths and differences.
+"""``--distributed`` with two real processes on this machine: results, signals, crashes, disagreements.
 
-The networks and data are tiny; nearly all of the time is that of starting and compiling.
+Networks and data are tiny; nearly all of the time goes into starting and compiling.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Links, anchors and pictures of the documentation hold, and the site builds where mkdocs is installed."""
+"""The documentation: links, anchors and pictures exist, and the site builds if mkdocs is installed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures as files: which ones there are for a world, and what the plot command refuses."""
+"""``experiments.plot``: the figures of each world, and what the command refuses."""
 
 from __future__ import annotations
 

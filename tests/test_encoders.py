@@ -1,4 +1,4 @@
-"""Encoders: observations of any shape and dtype, from the file of a dataset to the action."""
+"""Encoders: observations of any shape and dtype, from a dataset's file to the action."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The whole method at toy scale: pre-train on mazes of side 9, then adapt, and be better for it."""
+"""The whole method at toy scale: pre-train on mazes of side 9, then improve by adaptation."""
 
 from __future__ import annotations
 

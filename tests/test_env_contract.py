@@ -1,4 +1,4 @@
-"""What every world promises to the method, checked for each that ``envs.names`` lists."""
+"""The contract between worlds and the method, checked for every world in ``envs.names``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The episode loop: batches of episodes against single ones, and episodes played again."""
+"""The episode loop: batches of episodes against single ones, and replays."""
 
 from __future__ import annotations
 

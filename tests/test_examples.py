@@ -1,4 +1,4 @@
-"""The worlds in ``examples/`` are sound, and the guide shows one of them as it is."""
+"""The worlds in ``examples/`` are sound, and the guide quotes one of them verbatim."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Policies as ONNX models: onnxruntime against jax along whole greedy episodes, and what is refused."""
+"""ONNX export: onnxruntime against jax along whole greedy episodes, and policies that are refused."""
 
 from __future__ import annotations
 

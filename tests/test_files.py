@@ -1,4 +1,4 @@
-"""What is written appears whole or not at all, and a folder has one process that writes to it."""
+"""Files and folders are written atomically, and only one process may write to a folder."""
 
 from __future__ import annotations
 

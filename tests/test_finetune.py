@@ -1,4 +1,4 @@
-"""BC-finetune: returns, divergences, one update against oracles, and small worlds that it learns."""
+"""BC-finetune: returns, divergences, one update against oracles, and learning in small worlds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``--dry-run`` says in numbers what would be done, and does nothing."""
+"""``--dry-run``: prints estimates of the work, and does none of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figure 11: every world that can be drawn has a panel, and what is left out is said."""
+"""Figure 11: every world that can be drawn has a panel, and the others are reported."""
 
 from __future__ import annotations
 

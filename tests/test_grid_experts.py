@@ -1,4 +1,4 @@
-"""The demonstrator of GridWorld, step by step and in numbers, and the dataset it gives."""
+"""The demonstrator of GridWorld: single steps, statistics, and its dataset."""
 
 from __future__ import annotations
 

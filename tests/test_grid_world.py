@@ -1,4 +1,4 @@
-"""GridWorld: episodes written out by hand, and many more against the rules in plain Python."""
+"""GridWorld: handwritten episodes, and many more against the rules in plain Python."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
-"""Every block of the guides runs as it stands: files are written, commands are called.
+"""Every code block of the guides runs as printed: files are written, commands are run.
 
-Trainings are slow; without ``--all``, the files run, and the method searches with an untrained policy.
+Trainings are slow: without ``--all``, only the files are run, and the method searches with an untrained
+policy.
 """
 
 from __future__ import annotations

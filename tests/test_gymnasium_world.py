@@ -1,4 +1,4 @@
-"""Worlds of gymnasium environments: pure from the outside, whatever the program asks of them."""
+"""Worlds made from gymnasium environments behave as pure functions, whatever a program does with them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Training that starts from the weights of a policy: which network, what is refused, exact resume."""
+"""``pretrain --init``: the network of the initial policy, refused settings, and exact resume."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is said of an installation: networks, extras, folders, as text and as JSON."""
+"""``experiments.list`` and ``experiments.info``: networks, extras and folders, as text and as JSON."""
 
 from __future__ import annotations
 

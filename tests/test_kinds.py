@@ -1,4 +1,4 @@
-"""Kinds of networks: each is trained, kept on disk, read back and told apart from the others."""
+"""Kinds of networks: each is trained, saved, loaded, and distinguished from the others."""
 
 from __future__ import annotations
 

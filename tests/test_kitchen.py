@@ -1,4 +1,4 @@
-"""The kitchen: its rules by hand, and its physics against MuJoCo and gymnasium-robotics."""
+"""The kitchen: its rules on handmade cases, and its physics against MuJoCo and gymnasium-robotics."""
 
 from __future__ import annotations
 

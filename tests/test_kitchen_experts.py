@@ -1,4 +1,4 @@
-"""The demonstrator of the kitchen: its kinematics against MuJoCo, and that it does what it is told."""
+"""The demonstrator of the kitchen: its kinematics against MuJoCo, and the subtasks that it completes."""
 
 from __future__ import annotations
 

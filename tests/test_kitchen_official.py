@@ -1,6 +1,6 @@
-"""The kitchen beside FrankaKitchen as gymnasium makes it: the same subtasks complete in both.
+"""The kitchen against gymnasium's FrankaKitchen: the same subtasks are completed in both.
 
-The two worlds are compared with each other and not with recorded numbers.
+The two worlds are compared with each other, not with recorded numbers.
 """
 
 from __future__ import annotations

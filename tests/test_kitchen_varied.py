@@ -1,4 +1,4 @@
-"""Kitchens with a scene and physics of their own: what is drawn, and that nothing else changes."""
+"""Kitchens with a randomized scene and physics: what is drawn, and that nothing else changes."""
 
 from __future__ import annotations
 

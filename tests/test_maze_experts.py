@@ -1,4 +1,4 @@
-"""The demonstrators of MazeRunner, replayed against their rules in numpy and networkx."""
+"""The demonstrators of MazeRunner against their rules in numpy and networkx."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Methods by name: records, hyper-parameters with bounds, modules of a user's own, and no jax for it."""
+"""Methods by name: records, bounds of hyper-parameters, users' own modules, all without jax."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Noise on observations and actions, around worlds with discrete and with continuous actions."""
+"""Noise on observations and actions, in worlds with discrete and with continuous actions."""
 
 from __future__ import annotations
 

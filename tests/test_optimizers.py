@@ -1,4 +1,4 @@
-"""Prompt optimizers on a toy world: contract, oracles in plain python, statistics of the arms."""
+"""Prompt optimizers in a toy world: their contract, oracles in plain Python, statistics of arms."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Logs of others: imported, exported and imported again, checked and described, one fault at a time."""
+"""``experiments.data``: importing logs, exporting and importing again, descriptions, and each fault."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A method outside of the repository, in one file: it adapts, and its settings are flags."""
+"""A user's own method in one file outside of the package: it adapts, and its settings are flags."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Training on data of one's own: its recipe, without a world and with one, and what goes on from it."""
+"""Training on a user's own dataset: its recipe, with and without a world, and what can follow."""
 
 from __future__ import annotations
 

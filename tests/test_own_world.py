@@ -1,4 +1,4 @@
-"""A world outside of the repository, in one file: every command runs in it, from data to tables."""
+"""A user's own world in one file outside of the package: every command runs, from data to tables."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pages as files: what is in them, what they refuse, and that nothing in them is markup of a user."""
+"""HTML pages as files: their content, inputs that are refused, and no markup from users' texts."""
 
 from __future__ import annotations
 

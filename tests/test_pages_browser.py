@@ -1,7 +1,7 @@
-"""The pages in Chromium: clicks, keyboard, a phone, dark mode, and no request and no error in any of them.
+"""The pages in Chromium: clicks, keyboard, a phone, dark mode; never a network request or an error.
 
-Needs playwright (extra ``browser``) and a Chromium of the system. Pictures of every screen are written to
-the folder ``$MGPO_SHOTS``, where that is set.
+Needs playwright (extra ``browser``) and a system Chromium. Screenshots are written to the folder
+``$MGPO_SHOTS`` if that is set.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The pages' JavaScript against JAX: rules, logits, greedy paths and searches; in node and Chromium."""
+"""The pages' JavaScript against JAX, in node and Chromium: rules, logits, greedy paths and searches."""
 
 from __future__ import annotations
 

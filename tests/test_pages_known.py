@@ -1,4 +1,4 @@
-"""What a plan knew, as a report shows it: told the recorded episodes again, and checked by other means."""
+"""What a plan knew, as a report shows it: recomputed from recorded episodes, and checked independently."""
 
 from __future__ import annotations
 

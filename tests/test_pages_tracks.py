@@ -1,4 +1,4 @@
-"""Episodes that jax plays again for a page: where the agent was, how few there are, and Crafter's map."""
+"""Episodes that are replayed for a page: the agent's track, how many are replayed, and Crafter's map."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Command lines: one parser decides, nothing is given twice, and what is wrong is said in one line."""
+"""Command lines: one parser decides, no flag may be given twice, and errors are a single line."""
 
 from __future__ import annotations
 

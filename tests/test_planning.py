@@ -1,4 +1,4 @@
-"""The plan: its map against networkx, rehearsals against episodes, orders against a hand-made task."""
+"""The method ``plan``: its map against networkx, rehearsals against episodes, orders on a handmade task."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures: what is drawn where, on data made by hand."""
+"""Figures: what is drawn where, on handmade data."""
 
 from __future__ import annotations
 

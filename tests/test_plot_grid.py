@@ -1,4 +1,4 @@
-"""Pictures of GridWorld: what is drawn where, on data made by hand."""
+"""Figures of GridWorld: what is drawn where, on handmade data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The video of the kitchen: what stands above and below its pictures."""
+"""The video of the kitchen: the text above and below its frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Policies on disk: what is saved comes back, what is broken says so, what was released acts as before."""
+"""Policies on disk: round trips, clear errors for damage, and released policies that act as before."""
 
 from __future__ import annotations
 

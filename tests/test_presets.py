@@ -1,4 +1,4 @@
-"""Presets of a world against the general ones, and records that break or take what is not theirs."""
+"""Presets of worlds against the general ones, and records that are broken or take a name in use."""
 
 from __future__ import annotations
 

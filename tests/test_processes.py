@@ -1,4 +1,4 @@
-"""What processes tell each other on the host, and that no collective joins CPU devices of one process."""
+"""Messages between processes on the host, and that no collective joins CPU devices of one process."""
 
 from __future__ import annotations
 

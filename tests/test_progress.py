@@ -1,4 +1,4 @@
-"""What long work says where stderr is no terminal."""
+"""The progress of long work, if stderr is not a terminal."""
 
 from __future__ import annotations
 

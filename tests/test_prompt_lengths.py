@@ -1,4 +1,4 @@
-"""Figure 9 in numbers: prompts of each length come from the best trajectories; only whole ones count."""
+"""Figure 9 in numbers: prompts of each length come from the best trajectories; short ones do not count."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ``import mgpo_jax`` offers, and the shortest way from a dataset to a policy that acts."""
+"""The public names of ``mgpo_jax``, and the shortest way from a dataset to a policy that acts."""
 
 from __future__ import annotations
 

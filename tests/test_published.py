@@ -1,4 +1,4 @@
-"""The published results: their episodes can be played again, and folders of the first format are read."""
+"""The published results: their episodes can be replayed, and folders in format 1 can be read."""
 
 from __future__ import annotations
 

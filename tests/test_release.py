@@ -1,4 +1,4 @@
-"""Releasing a run: what is packed, and which runs are refused before anything is written."""
+"""``experiments.release``: the released files, and runs that are refused before anything is written."""
 
 from __future__ import annotations
 

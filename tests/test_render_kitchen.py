@@ -1,4 +1,4 @@
-"""Pictures of the kitchen, where there is OpenGL, and a clear word where there is none."""
+"""Pictures of the kitchen if there is OpenGL, and a clear error if there is none."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ablations by one command: what is finished stays, what is not goes on, the table says what it is of."""
+"""``experiments.reproduce``: finished pieces are kept, others continue, tables state their budget."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Results on disk: what is read is what was written, and what is damaged is named."""
+"""Results on disk: round trips, and errors that name the damage."""
 
 from __future__ import annotations
 

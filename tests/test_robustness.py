@@ -1,4 +1,4 @@
-"""Table 3: published rows are used if they are of the same adaptation, the others are measured once."""
+"""Table 3: published rows of the same adaptation are used, the others are measured once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The episode loop: golden episodes, lanes against single runs, policies replayed by the full pass."""
+"""Rollouts: golden episodes, lanes against single runs, and cached decoding against the full pass."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Many adaptations at once: variants and groups change nothing but speed, judgements are averages."""
+"""Many adaptations in one program: variants and groups only change speed, judgements are averages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a resumed run is compared by."""
+"""What a resumed run is compared with: the identity of the run, and its devices and versions."""
 
 from __future__ import annotations
 

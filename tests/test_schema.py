@@ -1,4 +1,4 @@
-"""Files against their schemas: what is refused, before memory is taken for it, and what is converted."""
+"""Files against their schemas: what is refused before memory is allocated, and what is converted."""
 
 from __future__ import annotations
 

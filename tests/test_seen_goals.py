@@ -1,4 +1,4 @@
-"""Goals of a training, and goals that lie far from them."""
+"""The goals seen in a training, and warnings of goals far from them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings: ranges are enforced for libraries as for command lines, and messages name the flag."""
+"""Settings: ranges are enforced in library calls and on command lines, and messages name the flag."""
 
 from __future__ import annotations
 

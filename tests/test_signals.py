@@ -1,4 +1,4 @@
-"""Requests to stop: what the first does, what the second does, and that a thread leaves signals alone."""
+"""Requests to stop: the first signal, the second signal, and commands outside of the main thread."""
 
 from __future__ import annotations
 

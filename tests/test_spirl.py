@@ -1,4 +1,4 @@
-"""SPiRL: the loss of skills, their windows, acting them out, and the soft actor-critic over them."""
+"""SPiRL: the loss of skills, their windows, acting under skills, and the soft actor-critic over them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""IQM, bootstrap intervals and comparisons against scipy and against what they must do."""
+"""IQM, bootstrap intervals and comparisons, against scipy and known properties."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Searches that end early: the same episodes until then, and none after."""
+"""``--stop-at``: a stopped search has the same episodes until its end, and none after it."""
 
 from __future__ import annotations
 

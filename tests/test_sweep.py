@@ -1,4 +1,4 @@
-"""``adapt --sweep``: words as variants, one program, and the results of single runs."""
+"""``adapt --sweep``: parsing, a single program for all variants, and the same results as single runs."""
 
 from __future__ import annotations
 

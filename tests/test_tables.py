@@ -1,4 +1,4 @@
-"""Summaries and tables: what a row says it is of, what contradicts, and nothing raw from a file."""
+"""Summaries and tables: what rows state, files that contradict each other, and no raw text from files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tasks of training, evaluation and test never meet; what is evaluated on the way of a training."""
+"""Training, evaluation and test tasks are disjoint; the evaluations during a training."""
 
 from __future__ import annotations
 

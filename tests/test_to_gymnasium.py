@@ -1,4 +1,4 @@
-"""The worlds as gymnasium environments, by gymnasium's own checker and against the worlds themselves."""
+"""Worlds as gymnasium environments: gymnasium's own checker, and comparison with the worlds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pre-training: the loss by hand, gradients however a batch is divided, exact resume, schedules."""
+"""Pre-training: the loss by hand, gradients for any division of a batch, exact resume, schedules."""
 
 from __future__ import annotations
 

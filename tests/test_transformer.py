@@ -1,4 +1,4 @@
-"""The network: causality, padding, the cache against the full pass, sizes, dropout."""
+"""The Transformer: causality, padding, the cache against the full pass, sizes, dropout."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The wheel holds all that an installed package needs, and works where other packages have our names."""
+"""The wheel contains all that an installed package needs, and works beside packages with our names."""
 
 from __future__ import annotations
 

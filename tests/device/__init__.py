@@ -1,1 +1,1 @@
-"""Speed in wall time on an accelerator."""
+"""Measurements of wall time on an accelerator."""

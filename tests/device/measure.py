@@ -8,8 +8,8 @@ docs/speed.md, *On a GPU*; defaults are those of MazeRunner-15 there.
     PYTHONPATH=tests python -m device.measure train maze15
     PYTHONPATH=tests python -m device.measure physics 64 512 4096
 
-Run one at a time and beside nothing else, since other work makes the figures worse. Compile times are
-those of an empty folder ``MGPO_CACHE``. ``kitchen-native`` needs ``JAX_PLATFORMS=cuda,cpu`` on a GPU.
+Run them one at a time on an otherwise idle machine. Compile times need an empty folder ``MGPO_CACHE``.
+``kitchen-native`` needs ``JAX_PLATFORMS=cuda,cpu`` on a GPU.
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ from mgpo_jax.policy_files import load_policy
 from mgpo_jax.tasks import test_tasks
 
 Figures = dict[str, float]
-CONTROL_STEPS = 40  # of each world, in a measurement of physics
+CONTROL_STEPS = 40  # control steps of each world in a measurement of physics
 
 
 def wall_time() -> Any:
-    """A context in which the clocks of the bench and of outcomes show wall time."""
+    """A context in which the bench and outcomes measure wall time instead of CPU time."""
     return mock.patch.object(time, "process_time", time.perf_counter)
 
 
 def seconds(work: Callable[[], Any], repeats: int = 1) -> float:
-    """The wall time of one run of ``work``."""
+    """The mean wall time of a run of ``work``."""
     start = time.perf_counter()
     for _ in range(repeats):
         result = work()
@@ -68,7 +68,7 @@ def product_rate(size: int, dtype: str, precision: str | None) -> float:
 
 
 def rates(size: int = 2048, large: int = 8192) -> Iterator[Figures]:
-    """Matrix products of one size in float32 and of a large one in bfloat16, and an empty loop."""
+    """Rates of a matrix product in float32 and of a larger one in bfloat16, and of an empty loop."""
     yield {"TFLOP/s in float32": product_rate(size, "float32", None)}
     yield {"TFLOP/s in float32, highest precision": product_rate(size, "float32", "highest")}
     yield {"TFLOP/s in bfloat16": product_rate(large, "bfloat16", None)}
@@ -94,7 +94,7 @@ def adapt(
     segments: int = envs.episodes.MAX_SEGMENTS,
     runs: int = 2,
 ) -> Iterator[Figures]:
-    """UCB with the released policy on the test tasks; only the first run compiles."""
+    """Adapt to the test tasks with UCB and the released policy; only the first run compiles."""
     record = envs.find(world)
     policy = load_policy(record)
     some = jax.tree.map(lambda leaf: leaf[:tasks], test_tasks(record))
@@ -136,9 +136,10 @@ def train(
     batch_size: int = 64,
     steps: int = 200,
 ) -> Iterator[Figures]:
-    """Gradient steps of the fast recipe on demonstrations that are collected first.
+    """Gradient steps of the preset "fast" on demonstrations that are collected first.
 
-    Where a part is the whole batch, each batch has nearly one length: good for timing only.
+    If a part is the whole batch, the trajectories of a batch have nearly the same length, which is good for
+    timing only.
     """
     record, env = envs.find(world), envs.make(world)
     recipe = pretrain_preset(world, "fast")
@@ -189,14 +190,14 @@ def physics_of(num: int) -> Figures:
 
 
 def physics(worlds: tyro.conf.Positional[tuple[int, ...]]) -> Iterator[Figures]:
-    """Control steps of the kitchen's two engines, with so many worlds at once."""
+    """Control steps of the kitchen's two engines, with the given numbers of worlds at once."""
     yield from map(physics_of, worlds)
 
 
 def main() -> None:
     commands: Any = {command.__name__: command for command in (rates, adapt, train, physics)}
     found: Iterator[Figures] = tyro.extras.subcommand_cli_from_dict(commands, description=__doc__)
-    configure()  # early enough: jax is imported, but has not looked for devices yet
+    configure()  # works although jax is imported, since it has not looked for devices yet
     devices = f"{jax.device_count()} x {jax.devices()[0].device_kind}"
     print(f"jax {jax.__version__}, {devices}", flush=True)
     for figures in found:

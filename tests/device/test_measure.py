@@ -1,4 +1,4 @@
-"""The script of docs/speed.md at its smallest size, on what is there."""
+"""The script of docs/speed.md at its smallest size, on whatever device there is."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ one:
     python tests/digests/compare.py --tier full
 
 ``quick`` takes about two minutes, ``full`` half an hour on two cores. ``recorded.json`` beside this file
-holds the digests, the machine they are of and the revision that made them.
+holds the digests, and the machine and the revision that they were recorded with.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ import numpy as np
 HERE = Path(__file__).parent
 ROOT = HERE.parent.parent
 RECORDED = HERE / "recorded.json"
-# Of a summary of one seed, for which older versions recorded 0 or an empty interval.
+# Entries of a summary for which older versions recorded 0 or an empty interval with a single seed.
 SPREADS = ("final_return_std_over_seeds", "final_return_iqm_95", "regret_std_over_seeds")
-TIMES = ("cpu_seconds", "episodes_per_cpu_second")  # of a summary: never the same twice
+TIMES = ("cpu_seconds", "episodes_per_cpu_second")  # entries of a summary that differ in every run
 
 
 class Case(NamedTuple):
-    """One command and the tier it belongs to."""
+    """A command and the tier that it belongs to."""
 
     command: str
     tier: str
@@ -88,7 +88,7 @@ def digest_of_arrays(arrays: Mapping[str, np.ndarray]) -> str:
 
 
 def run_case(case: Case, checkout: Path, scratch: Path) -> dict[str, Any]:
-    """What the command of a case leaves behind, as values and digests."""
+    """Run the command of a case; returns its results as values and digests."""
     out = scratch / "out"
     shutil.rmtree(out, ignore_errors=True)
     words = case.command.split()
@@ -122,7 +122,7 @@ def two_tasks(checkout: Path, env: str, scratch: Path) -> Path:
 
 
 def differences(recorded: dict[str, Any], found: dict[str, Any]) -> list[str]:
-    """What is missing or has another value; new names are fine."""
+    """Entries that are missing or have another value; new entries are fine."""
     return [
         f"{name}: recorded {value}, found {found.get(name)}"
         for name, value in recorded.items()

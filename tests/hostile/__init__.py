@@ -1,1 +1,1 @@
-"""Suites that try to break the commands: bad input, kills, signals, full disks, two at once."""
+"""Suites that try to break the commands: bad input, kills, signals, full disks, concurrent commands."""

@@ -1,4 +1,4 @@
-"""What a case of the fuzz suite is, and the damage that its grammars do to a file."""
+"""The records of the fuzz suite: a case, and the damage that its grammars do to a file."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from typing import Any, Literal
 import numpy as np
 
 Expected = Literal["refused", "accepted", "either"]
-"""What has to become of an input; ``either`` is refused clearly or accepted, and nothing worse."""
+"""How a command must treat an input; ``either`` means that it may refuse it clearly or accept it."""
 
 USAGE, DATA, BOTH = (2,), (1,), (1, 2)
 
 
 @dataclass(frozen=True)
 class Damage:
-    """What is done to one file."""
+    """A change to one file."""
 
     text: str
-    """In words, for the report."""
+    """The change in words, for the report."""
     expected: Expected
     do: Callable[[Path], None]
     """Called with the path of the file."""
@@ -36,33 +36,33 @@ class Case:
     words: Sequence[str]
     """The command line, without the name of the command."""
     kind: str
-    """What is bad: ``flags``, or the file."""
+    """The kind of the bad input: ``flags``, or the file."""
     change: str
-    """What was done to the file, in words; empty for a bad flag."""
+    """The change to the file, in words; empty for a bad flag."""
     expected: Expected
     codes: tuple[int, ...] = USAGE
     """Exit codes that a refusal may have."""
     needs: Sequence[str] = ()
-    """Which sound folders and files lie in the current folder before the change."""
+    """Sound folders and files to put into the current folder before the change."""
     prepare: Callable[[Path], None] | None = None
-    """Makes the change, in the current folder."""
+    """Makes the change, given the current folder."""
     names: Sequence[str] = ()
-    """A refusal has to hold one of them: the flag or the file."""
+    """Names of the flag or the file, one of which a refusal must contain."""
     found: Sequence[str] = ()
-    """A refusal has to hold one of them, unless there are none: the value that was found."""
+    """Spellings of the bad value, one of which a refusal must contain, if there are any."""
     check: Callable[[Path], str] | None = None
-    """Called with the current folder after the case was accepted: what is wrong there, or nothing."""
+    """Called with the current folder if the command accepted; returns what is wrong, or an empty text."""
     outputs: Sequence[str] = ()
-    """Where a command that is not refused may write."""
+    """Where a command that accepts its input may write."""
 
 
 def pick(rng: np.random.Generator, choices: Sequence[Any]) -> Any:
-    """One of the choices, as it is."""
+    """Draw one of the choices, without converting it to a numpy type."""
     return choices[int(rng.integers(len(choices)))]
 
 
 def written(data: bytes) -> Callable[[Path], None]:
-    """Damage that replaces a file, which may be a link to a sound one, by other bytes."""
+    """Damage that replaces a file, which may be a link to a sound one, with other content."""
 
     def do(path: Path) -> None:
         path.unlink(missing_ok=True)

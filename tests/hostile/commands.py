@@ -1,4 +1,4 @@
-"""Three long commands in a small world, and what has to be the same however often they were interrupted."""
+"""Three long commands in a small world, and checks that interruptions do not change their results."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from .processes import Server, Trap
 
 WORLD = "--env own_world:WORLD"
 VARIES = ("cpu_seconds", "cpu_seconds_per_step", "episodes_per_cpu_second", "out", "resume")
-"""Entries of JSON documents that are never the same twice, or tell how a command was called."""
+"""Entries of JSON documents that differ from run to run, or depend on how a command was called."""
 
 
 @dataclass(frozen=True)
 class Long:
-    """A command that takes its time, and the folder that it makes."""
+    """A long command, and the folder that it makes."""
 
     line: str
     out: str
@@ -47,10 +47,10 @@ LONG = {"pretrain": PRETRAIN, "adapt": ADAPT, "collect": COLLECT}
 
 
 class Reference:
-    """What the commands make when nothing happens to them, and copies of what they need.
+    """The results of uninterrupted commands, and copies of what they need.
 
     Args:
-      folder: where they ran.
+      folder: the folder that they run in.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -74,17 +74,17 @@ class Reference:
         shutil.move(half / "run", self.folder / "half_run")
 
     def operations(self, name: str) -> int:
-        """How many operations of a command change files."""
+        """The number of operations of a command that change files."""
         return int((self.folder.parent / f"{name}.count").read_text())
 
     def furnish(self, folder: Path, *made: str) -> Path:
-        """Copy the dataset and the policy that the commands need, and what some of them made."""
+        """Copy the dataset and the policy that the commands need, and results of some of them."""
         for name in ("data", "policy", *made):
             shutil.copytree(self.folder / name, folder / name)
         return folder
 
     def check(self, folder: Path, long: Long) -> None:
-        """Check that a command ended in the same bits, and left nothing else."""
+        """Check that the result of a command is the same bit for bit, and that it left nothing else."""
         found, wanted = contents(folder / long.out), contents(self.folder / long.out)
         assert found == wanted
         litter = [
@@ -96,10 +96,7 @@ class Reference:
 
 
 def contents(folder: Path) -> dict[str, Any]:
-    """What is in a folder that a command made, by the names of the files.
-
-    Checkpoints do not count, nor how the command was called.
-    """
+    """The contents of a result folder, by file name, without checkpoints and entries that vary."""
     return {
         str(path.relative_to(folder)): _content(path)
         for path in sorted(folder.rglob("*"))

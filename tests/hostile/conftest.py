@@ -1,4 +1,4 @@
-"""One server of processes for each worker of pytest; compiled programs and references are shared by all."""
+"""Fixtures: a process server for each worker of pytest; all share compiled programs and references."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .processes import Server  # noqa: E402
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:
-    """Say how many kills there were, in how many interrupted runs of each command."""
+    """Print the numbers of kills and of interrupted runs of each command."""
     runs: dict[str, list[int]] = {}
     for report in terminalreporter.getreports("passed") + terminalreporter.getreports("failed"):
         if report.when == "call":
@@ -30,7 +30,7 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
 
 @pytest.fixture(scope="session")
 def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder that all workers of a test run have in common."""
+    """A folder that all workers of a test run share."""
     base = tmp_path_factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "hostile"
     folder.mkdir(exist_ok=True)
@@ -39,7 +39,7 @@ def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def server(shared_folder: Path) -> Iterator[Server]:
-    """Starts commands in processes of their own."""
+    """A server that starts commands in their own processes."""
     server = Server(shared_folder / "cache")
     yield server
     server.close()
@@ -47,7 +47,7 @@ def server(shared_folder: Path) -> Iterator[Server]:
 
 @pytest.fixture(scope="session")
 def reference(server: Server, shared_folder: Path) -> Reference:
-    """What the long commands make when nothing happens to them; one worker makes it for all."""
+    """The results of uninterrupted long commands; one worker makes them for all."""
     reference = Reference(shared_folder / "reference")
     with open(shared_folder / "reference.lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
@@ -58,6 +58,6 @@ def reference(server: Server, shared_folder: Path) -> Reference:
 
 @pytest.fixture
 def here(server: Server, reference: Reference, tmp_path: Path) -> Iterator[Path]:
-    """A current folder for commands, with a dataset and a policy; what runs there ends with the test."""
+    """A current folder for commands, with a dataset and a policy; processes in it end with the test."""
     yield reference.furnish(tmp_path)
     server.end_all()

@@ -2,8 +2,8 @@
 
     PYTHONPATH=tests python -m hostile.fuzz --cases 5000 --seed 0 --report report.md
 
-Runs cases of ``grammar.py`` one after another, and writes how many of them ended how, with the smallest
-example of each kind of bad end. ``--first 17 --cases 1`` repeats case 17 and prints all of it.
+Runs cases of ``grammar.py`` one after another, and writes a report with counts of their outcomes and the
+smallest example of each kind of failure. ``--first 17 --cases 1`` repeats case 17 and prints all of it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-CLEAR_CACHES = 200  # cases, after which compiled programs are dropped, before they fill the memory
+CLEAR_CACHES = 200  # drop compiled programs after this many cases, before they fill the memory
 LONGEST = 120  # seconds after which a case that cannot be stopped ends the process
 
 
@@ -54,7 +54,7 @@ class Ended:
 
 
 def prepared() -> None:
-    """Make this process like that of a command, before jax is imported."""
+    """Configure this process like that of a command, before jax is imported."""
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     from experiments import runtime
 
@@ -111,13 +111,13 @@ def _counts(title: str, names: Sequence[str], outcomes: Sequence[str]) -> str:
 
 
 def signature(one: Ended) -> str:
-    """What bad ends have in common that have one cause, as far as can be told."""
+    """A text that failures with the same cause should have in common, to group them."""
     text = re.sub(r"'[^']*'|\d+|\S*/\S*", "..", f"{one.reason} {one.err}".splitlines()[0][:90])
     return f"{one.outcome}: {one.kind if one.kind != 'flags' else one.command + ' flags'}: {text}"
 
 
 def report(ended: Sequence[Ended], seed: int) -> str:
-    """All counts, and the smallest example of each bad end."""
+    """The report: all counts, and the smallest example of each kind of failure."""
     outcomes = [one.outcome for one in ended]
     bad = [one for one in ended if one.bad]
     slowest = max(ended, key=lambda one: one.seconds)

@@ -1,15 +1,15 @@
-"""Every case of the fuzz suite: a function of a seed and an index.
+"""The cases of the fuzz suite, each a function of a seed and an index.
 
-The suite knows commands and files by two tables, and what is added to the project joins by an entry.
+The suite is driven by tables, to which new commands and files must be added:
 
 - A new command needs an entry in ``grammar_flags.BASE``: a sound command line, and the sound folders that
-  it reads. Its flags are found in its dataclass. ``CONTRADICTIONS`` and ``VALID`` may add lines of its own,
+  it reads. Its flags are found in its dataclass. ``CONTRADICTIONS`` and ``VALID`` may add further lines,
   and ``work.PLACES`` says where its work begins.
-- A new kind of file needs entries in ``FILES`` below, one for each command that reads it: where it lies,
-  the command line, and the traits of what has to be refused. What is in the file is found by reading the
-  sound one, which ``sound.make`` has to make.
+- A new kind of file needs an entry in ``FILES`` below for each command that reads it: its path, the command
+  line, and the traits of what must be refused. ``sound.make`` must make a sound file, whose content is then
+  read to derive the damage.
 
-``MADE_BY_HAND`` holds damage that no grammar would think of, such as a maze whose goal is too far away.
+``MADE_BY_HAND`` holds damage that no grammar would produce, such as a maze whose goal is too far away.
 """
 
 from __future__ import annotations
@@ -276,7 +276,7 @@ def _one_file(rng: np.random.Generator) -> Callable[[Path], None]:
 
 
 def _checkpoints(rng: np.random.Generator, kind: FileKind, data: bytes) -> Damage:
-    """Damaged checkpoints: the run goes on from one that is sound, or refuses."""
+    """Damage checkpoints: the run must continue from a sound one, or refuse."""
     damages: dict[str, tuple[Callable[[Path], None], Expected]] = {
         "a file": (_swap, "refused"),
         "of empty files": (_each_file(lambda path: path.write_bytes(b"")), "either"),
@@ -293,14 +293,14 @@ def _checkpoints(rng: np.random.Generator, kind: FileKind, data: bytes) -> Damag
 
 
 def _other_weights_in(folder: Path) -> None:
-    """Sound weights with their hash, which are not those that were there."""
+    """Replace the weights by other sound ones, with their hash."""
     path = folder / "weights.npz"
     arrays = {name: 2 * array for name, array in read(path).items()}
     _mended(written(saved(arrays)), ("config.json", "sha256"))(path)
 
 
 def _copied_policy(rng: np.random.Generator, kind: FileKind, data: bytes) -> Damage:
-    """Damage to the copy of the policy that a run started from; without one, that is read again."""
+    """Damage the copy of the policy that a run started from; if it is missing, ``--init`` is read again."""
     damages: dict[str, tuple[Callable[[Path], None], Expected]] = {
         "a file": (_swap, "refused"),
         "of empty files": (_each_file(lambda path: path.write_bytes(b"")), "refused"),
@@ -318,7 +318,7 @@ def _copied_policy(rng: np.random.Generator, kind: FileKind, data: bytes) -> Dam
 
 
 def _old_result(rng: np.random.Generator, kind: FileKind, data: bytes) -> Damage:
-    """A result in the place of a row of a table that does not belong there."""
+    """Put a result that does not belong there in the place of a table's row."""
     damages: dict[str, Callable[[Path], None]] = {
         "found with other weights": lambda folder: None,
         "a file": _swap,
@@ -342,7 +342,7 @@ OTHERS: dict[str, Callable[[np.random.Generator, FileKind, bytes], Damage]] = {
 
 
 def _far_goal(arrays: dict[str, np.ndarray]) -> None:
-    """A snake of corridors, whose goal is further away than an episode has steps."""
+    """A winding corridor whose goal is farther away than an episode has steps."""
     side = arrays["maze"].shape[-1]
     maze = np.ones((side, side), arrays["maze"].dtype)
     for row in range(1, side - 1, 2):
@@ -396,7 +396,7 @@ def _hash(path: Path) -> str:
 
 
 def _mended(do: Callable[[Path], None], hash_in: tuple[str, str]) -> Callable[[Path], None]:
-    """Damage that also puts the new hash where the old one stood, so that deeper checks are reached."""
+    """Damage that also updates the recorded hash, so that later checks are reached."""
 
     def both(path: Path) -> None:
         do(path)
@@ -449,7 +449,7 @@ def _json(rng: np.random.Generator, traits: JsonTraits, sound: Path) -> Damage:
 
 
 def _other_weights(here: Path, sound: Path) -> str:
-    """What is wrong with the policy of a finished run that was resumed: nothing, or it changed."""
+    """Says if the policy of a finished run changed when the run was resumed; empty if it did not."""
     policy = here / "run/policy/weights.npz"
     if not policy.is_file():
         return ""  # the training goes on from an earlier step
@@ -459,10 +459,10 @@ def _other_weights(here: Path, sound: Path) -> str:
 
 
 def file_case(rng: np.random.Generator, sound: Path) -> Case:
-    """A sound command line, one of whose files is damaged.
+    """A sound command line with damage to one of its files.
 
     Args:
-      rng: what is drawn comes from here.
+      rng: source of randomness.
       sound: the folder that ``sound.make`` made.
     """
     kind = pick(rng, [kind for kind in FILES for _ in range(kind.weight)])
@@ -496,7 +496,7 @@ def file_case(rng: np.random.Generator, sound: Path) -> Case:
 
 
 def case(seed: int, index: int, sound: Path) -> Case:
-    """The case of that number: the same one whenever the tables and the sound material are the same."""
+    """The case with an index; it is the same as long as the tables and the sound material are."""
     rng = np.random.default_rng([seed, index])
     if rng.random() < FLAGS_SHARE:
         return flag_case(rng)

@@ -1,4 +1,4 @@
-"""Damage to a file whatever is in it: cut, empty, flipped, replaced by something that is no file."""
+"""Damage to any file, whatever its content: cut, empty, with flipped bits, or not a regular file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _replaced(make: Callable[[Path], None]) -> Callable[[Path], None]:
 
 
 def _nothing(path: Path) -> None:
-    """Leaves the place empty."""
+    """Leave the file missing."""
 
 
 PLACES: dict[str, Callable[[Path], None]] = {
@@ -35,11 +35,11 @@ PLACES: dict[str, Callable[[Path], None]] = {
     "a link to /dev/zero": lambda path: path.symlink_to("/dev/zero"),
     "a link to /dev/null": lambda path: path.symlink_to("/dev/null"),
 }
-"""What may lie where a file should."""
+"""What to put in the place of a file."""
 
 
 def file_damage(rng: np.random.Generator, data: bytes) -> Damage:
-    """Something that no reader of this file can take, or at least must not choke on."""
+    """Damage that every reader of this file must refuse, or at least survive."""
     cut = int(rng.integers(1, len(data))) if len(data) > 1 else 0
     contents = {
         "empty": b"",

@@ -1,7 +1,7 @@
-"""Command lines with a bad word, for every flag of every command, found in the dataclasses of settings.
+"""Command lines with a bad word, for every flag of every command, derived from the settings dataclasses.
 
-A flag that is added later joins by itself, and is expected to refuse what is nonsense for its type: words
-that are no number, NaN, infinity, -1, 10**20, and 0 unless it stands in ``ZERO_IS_FINE``.
+New flags are covered automatically. They are expected to refuse nonsense for their type: words that are not
+numbers, NaN, infinity, -1, 10**20, and 0 unless the flag is in ``ZERO_IS_FINE``.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ ZERO_IS_FINE = {
     "seed", "data-seed", "warmup-steps", "weight-decay", "dropout", "obs-noise", "action-noise", "c",
     "tasks", "goal-columns", "action-low", "action-high",
 }  # fmt: skip
-"""Numbers of these flags count from 0."""
+"""Flags of numbers for which 0 is valid."""
 
 OF_THE_WORLD = {"head", "encoder"}
-"""Flags of which a world may refuse choices that others take."""
+"""Flags with choices that only some worlds accept."""
 
 FREE = {"name"}
-"""Flags that give something a name, of which most words are one."""
+"""Flags that take nearly any word, such as a name."""
 
 OUTPUTS = {"out", "json"}
-"""Flags that name what is written."""
+"""Flags that name output files."""
 
 BASE: dict[str, tuple[str, tuple[str, ...]]] = {
     "list": ("", ()),
@@ -73,7 +73,7 @@ MAY_WRITE = (
     "new", "new.json", "new.html", "new.csv", "report.html", "playground.html", "runs", "data", "figures",
     "new.onnx", "new_prefill.onnx", "policy.onnx", "policy_prefill.onnx",
 )  # fmt: skip
-"""Where commands may write that are not refused."""
+"""Where commands that accept their input may write."""
 
 CONTRADICTIONS: dict[str, tuple[tuple[str, str], ...]] = {
     "collect": (
@@ -209,7 +209,7 @@ CONTRADICTIONS: dict[str, tuple[tuple[str, str], ...]] = {
     "info": (("maze15", "maze15"),),
     "completion": (("bsh", "bash"), ("bash zsh", "zsh")),
 }
-"""Words that contradict each other or the sound input, and what the refusal has to name."""
+"""Words that contradict each other or the sound input, and what the refusal must name."""
 
 VALID: dict[str, tuple[str, ...]] = {
     "collect": ("--env maze15", "--demonstrator astar4 --env maze15", "--env=maze15"),
@@ -248,7 +248,7 @@ VALID: dict[str, tuple[str, ...]] = {
     "reproduce": ("table5 --only astar4", "--seeds 2", "figure8 --only 5 10"),
     "bench": ("--demonstrator astar4", "--trajectories 3"),
 }
-"""Further words that are right, beside every flag with its own default."""
+"""Valid words to add to the sound command lines, besides any flag with its default."""
 
 WORDS_WRONG = (
     "many",
@@ -272,20 +272,20 @@ class Flag:
     """One flag of a command, as its dataclass declares it."""
 
     name: str
-    """Without hyphens before it; empty for words without a flag."""
+    """Name without leading hyphens; empty for positional words."""
     kinds: frozenset[Any]
     """The types of its values."""
     choices: tuple[str, ...]
-    """Of a ``Literal``."""
+    """The values of a ``Literal``."""
     many: bool
     """Whether it takes several values."""
     default: Any
     spellings: tuple[str, ...]
-    """All words that stand for it."""
+    """All spellings of the flag, aliases included."""
 
 
 def _flatten(hint: Any) -> tuple[set[Any], tuple[str, ...], bool, list[Any]]:
-    """The types of a hint, its choices, whether it is a tuple, and the metadata on the way."""
+    """The types in a type hint, its choices, whether it is a tuple, and its metadata."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin is typing.Annotated:
         kinds, choices, many, metadata = _flatten(args[0])
@@ -307,7 +307,7 @@ def _flatten(hint: Any) -> tuple[set[Any], tuple[str, ...], bool, list[Any]]:
 
 
 def flags_of(config_class: type) -> list[Flag]:
-    """The flags that a dataclass of settings makes, those of dataclasses inside of it included."""
+    """The flags of a settings dataclass, including those of nested dataclasses."""
     found = []
     hints = typing.get_type_hints(config_class, include_extras=True)
     for field in dataclasses.fields(config_class):
@@ -316,7 +316,7 @@ def flags_of(config_class: type) -> list[Flag]:
         if dataclasses.is_dataclass(kind):
             found += flags_of(typing.cast(type, kind))
             continue
-        if kind is Any or not field.init:  # hyper-parameters, which the method decides about
+        if kind is Any or not field.init:  # hyper-parameters, which depend on the method
             continue
         positional = any("POSITIONAL" in repr(one).upper() for one in metadata)
         aliases = [alias for one in metadata for alias in getattr(one, "aliases", None) or ()]
@@ -336,10 +336,10 @@ def config_class(command: str) -> type:
 
 
 def all_flags(command: str) -> list[tuple[Flag, tuple[str, ...]]]:
-    """The flags of a command, with the words that have to stand beside them."""
+    """The flags of a command, each with the words that it needs beside it."""
     flags: list[tuple[Flag, tuple[str, ...]]] = [(f, ()) for f in flags_of(config_class(command))]
     if command == "adapt":
-        # The policy that is adapted follows prompts: methods of other networks refuse it.
+        # The sound policy follows prompts, so methods of other networks refuse it.
         for name in (n for n in methods.names() if methods.find(n).policy == MULTI_GOAL):
             words = ("--method", name)
             flags += [(flag, words) for flag in flags_of(methods.find(name).hyper)]
@@ -359,7 +359,7 @@ def without_flag(words: Sequence[str], flag: Flag) -> list[str]:
 
 
 def _bad_values(flag: Flag) -> list[tuple[str, Expected]]:
-    """Values of a flag, and what has to become of them."""
+    """Values of a flag, and how a command must treat them."""
     values: list[tuple[str, Expected]] = []
     numbers = flag.kinds & {int, float}
     if numbers:
@@ -529,7 +529,7 @@ def _contradiction(rng: np.random.Generator, command: str) -> Case:
 
 
 def _valid(rng: np.random.Generator, command: str) -> Case:
-    """A sound command line, with further words that are right."""
+    """A sound command line with further valid words."""
     words = base_words(command)
     expected: Expected = "accepted"
     texts = VALID.get(command, ())
@@ -562,7 +562,7 @@ WAYS = ((_one_bad_value, 7), (_odd_line, 2), (_contradiction, 2), (_valid, 2))
 
 
 def flag_case(rng: np.random.Generator) -> Case:
-    """A command line of any command; most have one fault."""
+    """A command line of any command; most have a single fault."""
     flags = {command: len(all_flags(command)) for command in COMMANDS}
     commands = [command for command, num in flags.items() for _ in range(2 + num // 6)]
     command = pick(rng, commands)

@@ -1,7 +1,7 @@
-"""Damage to JSON files: each entry missing, null, of another type, huge, nested; documents that are none.
+"""Damage to JSON files: entries missing, null, of another type, huge or nested; malformed documents.
 
-The grammar walks through the sound document, so that entries which are added later join by themselves.
-``JsonTraits`` says of which entries a command has to refuse what.
+The grammar walks through the sound document, so new entries are covered automatically. ``JsonTraits`` says
+which damage to which entries a command must refuse.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from .grammar_files import file_damage
 Place = tuple[str | int, ...]
 
 ESCAPED = "/tmp/fuzz-escaped"
-"""A place outside of all that a case may write to."""
+"""A path outside of all folders that a case may write to."""
 
 NAMES = (
     "", "../../x", ESCAPED, "..", ".", "\x1b[31mred", "a\nb", "maze15\n", "a|b", r"$\frac{$", "x" * 300,
     "trap:WORLD", "antigravity:x", "os:system", "maze51", "\u202egnp", "\x00", "%s%n", "{0.__class__}",
 )  # fmt: skip
-"""Texts that are no name of anything; ``trap`` is a module in the current folder."""
+"""Texts that do not name anything valid; ``trap`` is a module in the current folder."""
 
 WRONG: dict[type, tuple[Any, ...]] = {
     bool: (None, "true", 1, [], {}, 0.5),
@@ -45,26 +45,26 @@ OUT_OF_RANGE = (0, -1, 10**400, 10**12, 2**63)
 
 @dataclass(frozen=True)
 class JsonTraits:
-    """What a command has to refuse in one file. Patterns are of dotted names, such as ``network.*``."""
+    """What a command must refuse in one file, as patterns of dotted names, such as ``network.*``."""
 
     checked: Sequence[str] = ("*",)
-    """Entries whose type has to be right; elsewhere it may be."""
+    """Entries whose type must be right; others may have a wrong type."""
     required: Sequence[str] = ()
-    """Entries that may not be missing."""
+    """Entries that must not be missing."""
     positive: Sequence[str] = ()
-    """Numbers that are at least 1 and small."""
+    """Numbers that must be at least 1 and small."""
     shares: Sequence[str] = ()
-    """Numbers from 0 to 1."""
+    """Numbers that must be from 0 to 1."""
     names: Sequence[str] = ()
-    """Texts that have to be a known name."""
+    """Texts that must be a known name."""
     closed: Sequence[str] = ()
-    """Objects that may have no further entry; the document itself is ``.``."""
+    """Objects that must not have further entries; the document itself is ``.``."""
     nullable: Sequence[str] = ()
-    """Entries that may be null in a sound file, and may so be null or absent."""
+    """Entries that may be null or absent."""
     texts: Sequence[str] = ()
     """Entries that may be any text."""
     document: Expected = "refused"
-    """What becomes of a document that is damaged as a whole."""
+    """How a command must treat a document that is damaged as a whole."""
 
 
 def dotted(place: Place) -> str:
@@ -76,13 +76,13 @@ def _fits(place: Place, patterns: Sequence[str]) -> bool:
 
 
 def _preferred(rng: np.random.Generator, found: Sequence[Place], patterns: Sequence[str]) -> Place:
-    """One of some places, mostly one of which a command has to refuse something."""
+    """Draw one of some places, preferably one that matches the patterns."""
     fitting = [place for place in found if _fits(place, patterns)]
     return pick(rng, fitting if fitting and rng.random() < 0.85 else found)
 
 
 def places(document: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
-    """All entries of a document with where they stand."""
+    """All entries of a document, with their places."""
     inside: Any = ()
     if isinstance(document, dict):
         inside = document.items()
@@ -114,7 +114,7 @@ def without(document: Any, place: Place) -> Any:
 
 
 def short(value: Any) -> str:
-    """A value for the report."""
+    """A value as short text for the report."""
     if isinstance(value, int) and abs(value) > 10**30:
         return "10**400"
     text = repr(value)
@@ -203,7 +203,7 @@ def _document(rng: np.random.Generator, document: Any, traits: JsonTraits) -> Da
 
 
 def _odd(rng: np.random.Generator, document: Any, traits: JsonTraits) -> Damage:
-    """Documents that a reader may take or refuse, but must not stumble over."""
+    """Documents that a reader may accept or refuse, but must survive."""
     text = json.dumps(document)
     some = next(iter(document))
     odd = {
@@ -234,7 +234,7 @@ WAYS = (
 
 
 def json_damage(rng: np.random.Generator, document: Any, traits: JsonTraits) -> Damage:
-    """Damage to the file of a JSON object."""
+    """Random damage to the file of a JSON object."""
     ways = [way for way, weight in WAYS for _ in range(weight)]
     return pick(rng, ways)(rng, document, traits)
 

@@ -1,7 +1,7 @@
-"""Damage to npz files: each array missing, of another kind, shape or size; zip files that are odd or lie.
+"""Damage to npz files: arrays missing, of another kind, shape or size; odd or lying zip files.
 
-The grammar walks through the arrays of the sound file, so that arrays which are added later join by
-themselves. ``NpzTraits`` says of which arrays a command has to refuse what.
+The grammar walks through the arrays of the sound file, so new arrays are covered automatically.
+``NpzTraits`` says which damage to which arrays a command must refuse.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from .grammar_files import file_damage
 
 Arrays = Mapping[str, np.ndarray]
 BOMB = 2_000_000_000  # bytes that a small file unpacks to
-LOCAL, CENTRAL = b"PK\x03\x04", b"PK\x01\x02"  # how the two records of a zip member begin
+LOCAL, CENTRAL = b"PK\x03\x04", b"PK\x01\x02"  # signatures of the two records of a zip member
 
 
 class Trap:
-    """Makes a file when it is unpickled."""
+    """An object that creates a file when it is unpickled."""
 
     def __reduce__(self) -> Any:
         return (open, ("trap_was_here", "w"))
@@ -38,22 +38,22 @@ class Trap:
 
 @dataclass(frozen=True)
 class NpzTraits:
-    """What a command has to refuse in one file. Patterns are of names of arrays."""
+    """What a command must refuse in one file, as patterns of names of arrays."""
 
     checked: Sequence[str] = ("*",)
-    """Arrays that have to be right; others may be anything, as long as nothing breaks."""
+    """Arrays that must be valid; others may be anything that nothing breaks on."""
     required: Sequence[str] = ()
-    """Arrays that may not be missing."""
+    """Arrays that must not be missing."""
     bounded: Sequence[str] = ()
-    """Arrays whose numbers have a range that excludes -1 and the largest number of the type."""
+    """Arrays whose range excludes -1 and the largest number of their dtype."""
     free: Sequence[str] = ()
-    """Arrays some of whose numbers nobody reads, so that these may be anything."""
+    """Arrays with numbers that are never read, so that these may be anything."""
     hash_in: tuple[str, str] | None = None
-    """The JSON file beside it, and the entry there that holds the hash of this one."""
+    """The JSON file beside this file, and its entry with the hash of this file."""
 
 
 def npy(array: np.ndarray, **header: Any) -> bytes:
-    """The bytes of an npy file, with other entries in its header than the array's."""
+    """The bytes of an npy file; ``header`` replaces entries of its header."""
     body = io.BytesIO()
     if not header:
         np.save(body, array, allow_pickle=array.dtype.hasobject)
@@ -65,7 +65,7 @@ def npy(array: np.ndarray, **header: Any) -> bytes:
 
 
 def npz(members: Mapping[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> bytes:
-    """The bytes of a zip file, the same at any time of the day."""
+    """The bytes of a zip file, without timestamps."""
     body = io.BytesIO()
     with zipfile.ZipFile(body, "w", method) as file:
         for name, data in members.items():
@@ -76,7 +76,7 @@ def npz(members: Mapping[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> byt
 
 
 def saved(arrays: Arrays, **others: bytes) -> bytes:
-    """An npz file of some arrays, of which some are other bytes."""
+    """The bytes of an npz file; ``others`` replaces the content of some members."""
     members = {name: others.get(name) or npy(array) for name, array in arrays.items()}
     return npz({f"{name}.npy": data for name, data in members.items()})
 
@@ -90,7 +90,7 @@ def _checked(name: str, traits: NpzTraits) -> Expected:
 
 
 def _some(rng: np.random.Generator, arrays: Arrays, traits: NpzTraits) -> str:
-    """The name of one array, more often one that has to be right."""
+    """Draw the name of an array, preferably one that must be valid."""
     checked = [name for name in arrays if _fits(name, traits.checked)]
     return pick(rng, checked if checked and rng.random() < 0.8 else list(arrays))
 
@@ -145,7 +145,7 @@ def _shape(rng: np.random.Generator, arrays: Arrays, traits: NpzTraits) -> Damag
 
 
 def _number(rng: np.random.Generator, arrays: Arrays, traits: NpzTraits) -> Damage:
-    """One number that is not finite, huge or outside of its range."""
+    """A number that is not finite, huge, or out of range."""
     name = _some(rng, {n: a for n, a in arrays.items() if a.size and a.dtype != bool}, traits)
     array = np.array(arrays[name])
     bounded = _fits(name, traits.bounded)
@@ -194,7 +194,7 @@ def _header(rng: np.random.Generator, arrays: Arrays, traits: NpzTraits) -> Dama
 
 
 def _patched(data: bytes, offset: int, value: bytes) -> bytes:
-    """The first member of a zip file with other bytes in both of its records."""
+    """The zip file with some bytes replaced in both records of its first member."""
     made = bytearray(data)
     for mark, shift in ((LOCAL, 0), (CENTRAL, 2)):
         start = made.index(mark) + offset + shift
@@ -222,7 +222,7 @@ def bomb(name: str, array: np.ndarray) -> bytes:
 
 
 def _zip(rng: np.random.Generator, arrays: Arrays, traits: NpzTraits) -> Damage:
-    """A zip file that is odd as a whole; the first array is the one that suffers."""
+    """A zip file that is odd as a whole, or in its first array."""
     name = _some(rng, {n: a for n, a in arrays.items() if a.ndim}, traits)
     arrays = {name: arrays[name], **arrays}
     sound = saved(arrays)
@@ -254,7 +254,7 @@ def _zip(rng: np.random.Generator, arrays: Arrays, traits: NpzTraits) -> Damage:
 
 
 def _member(rng: np.random.Generator, arrays: Arrays, traits: NpzTraits) -> Damage:
-    """Members that a reader may take or refuse, but must neither unpack nor run nor stumble over."""
+    """Surplus members that a reader may ignore or refuse, but must neither unpack nor run."""
     members = {f"{name}.npy": npy(array) for name, array in arrays.items()}
     first = next(iter(members))
     surplus = pick(
@@ -303,7 +303,7 @@ WAYS = (
 
 
 def npz_damage(rng: np.random.Generator, arrays: Arrays, traits: NpzTraits) -> Damage:
-    """Damage to an npz file."""
+    """Random damage to an npz file."""
     ways = [way for way, weight in WAYS for _ in range(weight)]
     return pick(rng, ways)(rng, arrays, traits)
 
@@ -319,7 +319,7 @@ def _wider(array: np.ndarray) -> np.ndarray:
 
 
 def _unsigned(array: np.ndarray) -> np.ndarray:
-    """Integers that are not negative as unsigned ones."""
+    """Non-negative integers in an unsigned dtype."""
     small = array.dtype.kind == "i" and array.size and array.min() >= 0
     return array.astype(np.uint64) if small else array
 

@@ -1,8 +1,8 @@
-"""Runs one case in this process, and judges what came of it.
+"""Run one case in this process, and judge its outcome.
 
-A case runs in a folder of its own, with a home of its own beside it. Everything under both is compared
-before and after: an input that changed, or a file that nobody asked for, is a fault whatever the command
-printed. Time is processor time, so that a busy machine matters little.
+A case runs in its own folder, with its own home folder beside it. Both are compared before and after: a
+changed input or an unexpected file is a fault, whatever the command printed. Time is CPU time, so that a
+busy machine matters little.
 """
 
 from __future__ import annotations
@@ -118,9 +118,9 @@ def _status(field: str) -> int:
 
 @contextmanager
 def bounded_memory() -> Iterator[Callable[[], int]]:
-    """Yields what says by how many bytes the memory has grown at most."""
+    """Limit the memory of the block; yields a function that returns its peak growth in bytes."""
     with suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")  # the largest memory counts from now on
+        Path("/proc/self/clear_refs").write_text("5")  # reset the peak
     before = _status("VmRSS")
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (_status("VmSize") + ROOM, hard))
@@ -132,7 +132,7 @@ def bounded_memory() -> Iterator[Callable[[], int]]:
 
 @contextmanager
 def captured(folder: Path) -> Iterator[Callable[[], tuple[str, str]]]:
-    """Both streams as files, also for what writes to them without Python."""
+    """Capture stdout and stderr in files, including output that bypasses Python."""
     paths = [folder / "stdout", folder / "stderr"]
     kept = [os.dup(1), os.dup(2)]
     streams = [sys.stdout, sys.stderr]
@@ -160,7 +160,7 @@ def _read(file: Any, path: Path) -> str:
 
 
 def snapshot(root: Path) -> dict[str, str]:
-    """Every file and folder under a root, with what tells whether it changed; pipes are not opened."""
+    """All files and folders under a root, with a fingerprint of each; pipes are not opened."""
     found = {}
     for folder, folders, files in os.walk(root):
         for name in (*folders, *files):
@@ -178,7 +178,7 @@ def snapshot(root: Path) -> dict[str, str]:
 
 @contextmanager
 def _plain_warnings() -> Iterator[None]:
-    """Warnings reach stderr as they do in a fresh process."""
+    """Let warnings reach stderr as they do in a fresh process."""
     with warnings.catch_warnings():
         warnings.resetwarnings()
         for kind in (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning):
@@ -194,7 +194,7 @@ def _show(message: Any, category: Any, filename: str, lineno: int, *_: Any) -> N
 
 
 def call(command: str, words: Sequence[str]) -> int | None:
-    """A command in this process: its exit code, or None if its work began."""
+    """Run a command in this process; returns its exit code, or None if its work began."""
     try:
         importlib.import_module(f"experiments.{command}").command(list(words))
     except WorkBegan:
@@ -207,7 +207,7 @@ def call(command: str, words: Sequence[str]) -> int | None:
 def run(
     case: Case, sound: Path, root: Path, command: Callable[[str, Sequence[str]], int | None] = call
 ) -> Ran:
-    """Run a case in a new folder under ``root``, which is removed afterwards."""
+    """Run a case in a new folder under ``root``, which is removed afterward."""
     shutil.rmtree(root, ignore_errors=True)
     here, home = root / HERE, root / "home"
     material.copy(sound, tuple(case.needs), here)
@@ -277,7 +277,7 @@ def _within(name: str, outputs: Sequence[str]) -> bool:
 
 
 def judge(case: Case, ran: Ran) -> tuple[Outcome, str]:
-    """What came of a case, and the reason in a few words where it is bad."""
+    """The outcome of a case, and the reason in a few words if it is bad."""
     if ran.escaped == "TooLong" or ran.seconds > MAX_SECONDS:
         return "hang", f"stopped after {ran.seconds:.0f} s of processor time"
     if ran.grown > MAX_BYTES:
@@ -311,12 +311,12 @@ def judge(case: Case, ran: Ran) -> tuple[Outcome, str]:
 
 
 def _control(text: str) -> str:
-    """The first character that does something to a terminal; empty if there is none."""
+    """The first control character; empty if there is none."""
     return next((c for c in text if not c.isprintable() and c not in "\n\t"), "")
 
 
 def unclear(case: Case, ran: Ran) -> str:
-    """What is wrong with a refusal; empty if nothing is."""
+    """What is wrong with a refusal, in words; empty if nothing is."""
     lines = ran.err.splitlines()
     if not lines or lines[-1][:6] != "error:":
         return f"exit code {ran.code} without a line that begins with error:"

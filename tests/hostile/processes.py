@@ -1,7 +1,7 @@
-"""Real commands in processes of their own, that start cheaply and can be killed, stopped and starved.
+"""Run real commands in processes that start cheaply, and that can be killed, stopped and starved.
 
-Importing jax and what goes with it costs seconds of CPU time. A server imports it once, runs no command of
-its own, and forks: each fork runs one command line as its own process would, or one after another.
+Importing jax and the commands costs seconds of CPU time. A server imports them once, runs no command
+itself, and forks: each fork runs one command line as a fresh process would, or one after another.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ HEAVY = (
     "experiments.training",
     "own_world",
 )
-# Two devices, as in all tests. Compiled programs are small and are run a few times only.
+# Two devices, as in all tests. Programs are small and run only a few times, so they are not optimized.
 XLA_FLAGS = (
     "--xla_force_host_platform_device_count=2 --xla_backend_optimization_level=0 "
     "--xla_llvm_disable_expensive_passes=true"
@@ -45,14 +45,14 @@ XLA_FLAGS = (
 )
 NEED_ROOM = ("open", "os.mkdir", "os.link", "os.symlink")
 CHANGES = (*NEED_ROOM, "os.rename", "os.remove", "os.rmdir", "os.truncate")
-"""Names of the events of ``sys.audit`` that change files; ``open`` only where it is for writing."""
+"""Events of ``sys.audit`` that change files; ``open`` only counts if it is for writing."""
 
 
 class Ended(NamedTuple):
-    """What a command left behind in its streams."""
+    """How a command ended, and what it printed."""
 
     code: int
-    """Exit code; the negative number of the signal that ended it, where one did."""
+    """Exit code, or the negative number of the signal that ended it."""
     out: str
     err: str
 
@@ -64,14 +64,14 @@ class Ended(NamedTuple):
 
 @dataclass(frozen=True)
 class Trap:
-    """What befalls a process just before one of its own operations that change files below its folder."""
+    """A disturbance of a process just before one of its operations that change files below its folder."""
 
     at: int
-    """The number of that operation, from 1."""
+    """The number of that operation, counted from 1."""
     number: int = signal.SIGKILL
-    """The signal that it gets; 0 for none, but a full disk from then on."""
+    """The signal to send; 0 to simulate a full disk from then on instead."""
     delay: float = 0.0
-    """Seconds until the signal, while the process goes on."""
+    """Seconds to wait before the signal, while the process goes on."""
 
 
 class Child:
@@ -84,14 +84,14 @@ class Child:
         self._end, self._out, self._err = end, out, err
 
     def send(self, number: int) -> None:
-        """Send it a signal."""
+        """Send a signal to the process."""
         os.kill(self.pid, number)
 
     def wait(self, limit: float = LIMIT) -> Ended:
-        """Wait for its end.
+        """Wait until the process ends.
 
         Raises:
-          TimeoutError: if it takes longer than ``limit`` seconds; it is killed.
+          TimeoutError: if that takes longer than ``limit`` seconds; the process is killed.
         """
         try:
             code = self._end(limit)
@@ -102,12 +102,12 @@ class Child:
 
     @property
     def err(self) -> str:
-        """What it has written to stderr so far."""
+        """What the process has written to stderr so far."""
         return _read(self._err)
 
     @property
     def is_held(self) -> bool:
-        """Whether SIGSTOP holds it up."""
+        """Whether the process is stopped by SIGSTOP."""
         return self._stat()[0] == "T"
 
     @property
@@ -116,11 +116,11 @@ class Child:
         return (int(self._stat()[11]) + int(self._stat()[12])) / os.sysconf("SC_CLK_TCK")
 
     def _stat(self) -> list[str]:
-        """What Linux tells about it, from its state on."""
+        """The fields of ``/proc/PID/stat``, from the state on."""
         return Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
 
     def wait_for(self, condition: Callable[[], bool], limit: float = LIMIT) -> None:
-        """Wait until something has happened."""
+        """Wait until a condition holds."""
         last = time.monotonic() + limit
         while not condition():
             assert time.monotonic() < last, f"it did not happen; stderr: {self.err}"
@@ -140,7 +140,7 @@ class Server:
     """Starts commands in forks of a process that has imported what they need.
 
     Args:
-      cache: folder of compiled programs, which all of them share.
+      cache: folder of compiled programs, which all commands share.
     """
 
     def __init__(self, cache: Path) -> None:
@@ -167,7 +167,7 @@ class Server:
         self._running: set[int] = set()
 
     def end_all(self) -> None:
-        """Kill what still runs."""
+        """Kill all processes that are still running."""
         for pid in self._running:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
@@ -181,14 +181,14 @@ class Server:
         self._process.wait(10)
 
     def start(self, line: str, folder: Path, trap: Trap | None = None, **options: str) -> Child:
-        """Start a command line in a process of its own.
+        """Start a command line in its own process.
 
         Args:
           line: the name of the command and its words.
           folder: its current folder.
-          trap: what befalls it.
+          trap: a disturbance of the process.
           **options: ``count`` names a file for the number of its operations that change files; ``stdout``
-            is ``closed``, ``broken`` (a pipe that nobody reads) or an encoding; with ``thread`` the command
+            is ``closed``, ``broken`` (a pipe without a reader) or an encoding; with ``thread`` the command
             does not run in the main thread.
         """
         out, err = _streams()
@@ -216,28 +216,28 @@ class Server:
         return mine
 
     def run(self, line: str, folder: Path, trap: Trap | None = None, **options: str) -> Ended:
-        """Run a command line in a process of its own, to its end."""
+        """Run a command line in its own process until it ends."""
         return self.start(line, folder, trap, **options).wait()
 
     def again(self, line: str, folder: Path) -> Ended:
-        """Run a command line in a process that has run others before, where nothing compiles twice."""
+        """Run a command line in a process that is reused, so that nothing compiles twice."""
         out, err = _streams()
         if self._steady is None:
             self._steady = self._ask({}, out, err)
-            self._steady.recv(100)  # it is ready
+            self._steady.recv(100)  # wait until it is ready
         request = json.dumps({"line": line, "folder": str(folder)}).encode()
         socket.send_fds(self._steady, [request], [out.fileno(), err.fileno()])
         self._steady.settimeout(LIMIT)
         return Ended(int(self._steady.recv(100)), _read(out), _read(err))
 
     def from_scratch(self, line: str, folder: Path, *, shell: str = "{}", **options: Any) -> Child:
-        """Start a command line as a user does, imports and all.
+        """Start a command line as a user does, in a fresh interpreter.
 
         Args:
           line: the command line.
           folder: its current folder.
-          shell: what a shell makes of it, such as ``{} >&-``.
-          **options: of ``subprocess.Popen``.
+          shell: template of the shell command, such as ``{} >&-``.
+          **options: options of ``subprocess.Popen``.
         """
         out, err = _streams()
         words = shell.format(f"exec {sys.executable} -m experiments.{line}")
@@ -255,11 +255,11 @@ class Server:
         return Child(process.pid, end, out, err)
 
 
-# From here on: what happens in the server and in its forks.
+# The functions below run in the server and in its forks.
 
 
 def serve(descriptor: int) -> None:
-    """Fork for each request until there are no more; only the server itself returns."""
+    """Fork for each request until there are no more; returns in the server only."""
     for name in HEAVY:
         importlib.import_module(name)
     requests = socket.socket(fileno=descriptor)
@@ -274,7 +274,7 @@ def serve(descriptor: int) -> None:
             _attend(json.loads(message), *files)
         for file in files:
             os.close(file)
-    for _ in range(children):  # so that their CPU time counts as that of the server
+    for _ in range(children):  # their CPU time then counts as the server's
         os.wait()
 
 
@@ -306,7 +306,7 @@ def _attend(request: dict[str, Any], reply: int, out: int, err: int) -> None:
 
 
 def _settle() -> None:
-    """Keep all compiled programs, also those that compile quickly."""
+    """Cache all compiled programs, including those that compile quickly."""
     import jax
 
     from experiments import runtime
@@ -336,7 +336,7 @@ def _call(line: str) -> NoReturn:
 
 
 def _call_in_thread(line: str) -> NoReturn:
-    """Fails unless what signals do was the same throughout."""
+    """Run a command in a thread; fails if it changes any signal handler."""
     before = [signal.getsignal(number) for number in signal.valid_signals()]
     codes: list[int] = []
 
@@ -370,11 +370,11 @@ def _spoil(stdout: str) -> None:
 
 
 def _remember(module: Any, name: str) -> None:
-    """Make objects of a class once for equal arguments, so that a training traces nothing twice."""
+    """Cache the objects of a class by their arguments, so that repeated trainings trace nothing twice."""
     kind, made = getattr(module, name), {}
 
     def make(*args: Any) -> Any:
-        # The text of a dataset is not all of it; there is one for each number of trajectories.
+        # The repr of a dataset does not identify it, but its number of trajectories does here.
         key = tuple(len(arg) if hasattr(arg, "lengths") else repr(arg) for arg in args)
         if key not in made:
             made[key] = kind(*args)
@@ -408,7 +408,7 @@ def _stay(answer: socket.socket) -> NoReturn:
 
 
 def _watch(request: dict[str, Any]) -> None:
-    """Count the operations that change files, and set the trap."""
+    """Count the operations that change files, and arm the trap."""
     trap = Trap(**request["trap"]) if "trap" in request else None
     here, lock = os.getcwd() + os.sep, threading.Lock()
     number = 0

@@ -1,4 +1,4 @@
-"""Sound material for the fuzz suite, all tiny: policy, result, tasks, dataset, a done and a begun run."""
+"""Tiny sound inputs for the fuzz suite: a policy, a result, tasks, datasets, and two training runs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ TRAP = "open('trap_was_here', 'w').close()\nWORLD = METHOD = 1\n"
 
 
 def run(command: str, words: str) -> None:
-    """One command in this process, which has to succeed."""
+    """Run a command in this process; it must succeed."""
     try:
         importlib.import_module(f"experiments.{command}").command(words.split())
     except SystemExit as stop:
@@ -39,7 +39,7 @@ def run(command: str, words: str) -> None:
 
 
 def make(folder: Path) -> Path:
-    """The material in a folder; made if it is not there, by one process if several ask."""
+    """Make the material in a folder unless it exists; of several processes, one makes it."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     with open(folder.with_suffix(".lock"), "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
@@ -54,7 +54,7 @@ def make(folder: Path) -> Path:
 
 
 def _collect_with_noise() -> None:
-    """The dataset of the runs, as if its demonstrator had told what it intended."""
+    """Make the dataset of the runs, as if its demonstrator recorded intended actions."""
     run("collect", COLLECT)
     (folder,) = Path("data/maze15").iterdir()
     path, manifest = folder / "trajectories.npz", folder / "manifest.json"
@@ -66,7 +66,7 @@ def _collect_with_noise() -> None:
 
 
 def _judge_by_sampling(folder: Path) -> None:
-    """Make a result as if its world judged by sampled actions and had names for two goals."""
+    """Change a result as if its world judged by sampled actions and named two goals."""
     from experiments.store.statistics import gain_over_tasks
 
     arrays = read(folder / "results.npz")
@@ -83,7 +83,7 @@ def _judge_by_sampling(folder: Path) -> None:
 
 
 def _make() -> None:
-    """Everything, in the current folder."""
+    """Make everything in the current folder."""
     from mgpo_jax.tasks import test_tasks
     from mgpo_jax.trees import named_leaves
 
@@ -94,7 +94,7 @@ def _make() -> None:
     shutil.copytree("run/policy", "policy")
     with replaced(EVALUATION):
         run("pretrain", PRETRAIN.replace("--out run", "--out begun --init policy"))
-    for name in ("policy", "checkpoints"):  # as if it had been killed before its first checkpoint
+    for name in ("policy", "checkpoints"):  # as if killed before the first checkpoint
         shutil.rmtree(f"begun/{name}")
     Path("begun/training.png").unlink()
     leaves = named_leaves(test_tasks("maze15"), "task")
@@ -118,11 +118,11 @@ def _make() -> None:
 
 
 ALWAYS = ("file.txt", "trap.py", "empty", "full", "dangling")
-"""What lies in the current folder of every case."""
+"""Files and folders that are in the current folder of every case."""
 
 
 def copy(sound: Path, names: tuple[str, ...], here: Path) -> None:
-    """Copies of some material as a new current folder."""
+    """Copy some material to a new current folder."""
     here.mkdir(parents=True)
     for name in dict.fromkeys((*names, *ALWAYS)):
         source = sound / name

@@ -1,6 +1,6 @@
-"""States that a kill, a power cut or a mistake leaves: one command goes on from each of them.
+"""States that a kill, a power cut or a mistake leaves behind: one command continues from each of them.
 
-Where a command is refused, its message names the way out, and that is walked.
+If a command is refused, its message names a way out, which the test then takes.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Full disks, places where nothing can be made, closed streams, and other odd surroundings."""
+"""Full disks, unwritable places, closed streams, and other odd environments."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Whatever the command line and the files are, a command refuses them in one clear line or does its work.
 
-200 cases run always, 5,000 with ``--all``; ``PYTHONPATH=tests python -m hostile.fuzz --help`` says how to
-run others. The oracle is tested on commands that misbehave on purpose.
+200 cases always run, 5,000 with ``--all``; ``PYTHONPATH=tests python -m hostile.fuzz --help`` explains how
+to run others. The oracle itself is tested on commands that misbehave on purpose.
 """
 
 from __future__ import annotations

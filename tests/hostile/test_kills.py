@@ -1,8 +1,7 @@
-"""Commands that are killed, again and again, end in the same bits when they are resumed.
+"""Commands that are killed repeatedly end with the same bits when they are resumed.
 
-A process is killed (signal 9) at one of its own operations on files: between the two writes of a save, for
-example. Some kills come a random while after that, in the middle of whatever is done then. ``--all`` has
-some 200 kills more than those of every test run.
+A process is killed (SIGKILL) at one of its operations on files, for example between the two writes of a
+save. Some kills come a random time later. ``--all`` adds some 200 kills.
 """
 
 from __future__ import annotations

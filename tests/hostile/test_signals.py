@@ -1,4 +1,4 @@
-"""Signals that ask a command to stop: what is done is kept, and one line names the way on."""
+"""Signals that ask a command to stop: finished work is kept, and one line says how to continue."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two commands at once: in one folder, or both in want of the same dataset."""
+"""Two commands at once: in the same folder, or in need of the same dataset."""
 
 from __future__ import annotations
 

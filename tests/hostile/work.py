@@ -1,6 +1,6 @@
-"""Where the work of the commands begins: the fuzz suite stops them there, after every check.
+"""Where the work of each command begins, after all checks; the fuzz suite stops commands there.
 
-A command that gets so far has accepted its input. When code moves, only this table has to follow.
+A command that gets there has accepted its input. When code moves, only this table must follow.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from unittest import mock
 
 
 class WorkBegan(BaseException):
-    """Raised in place of the work; no handler of errors takes it for one."""
+    """Raised in place of the work; not an ``Exception``, so that no error handler catches it."""
 
 
 def begin(*args: Any, **kwargs: Any) -> Any:
@@ -21,7 +21,7 @@ def begin(*args: Any, **kwargs: Any) -> Any:
 
 
 class Evaluation:
-    """In place of the greedy evaluation of a training, which would take long to compile."""
+    """Replaces the evaluation during a training, which would take long to compile."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         pass
@@ -47,12 +47,12 @@ PLACES: tuple[tuple[str, str, Any], ...] = (
     ("experiments.exporting", "facts_of", begin),
     ("experiments.measurements", "measurements", begin),
 )
-"""Module, name in it, and what stands there instead."""
+"""Modules, names in them, and what to put there instead."""
 
 
 @contextmanager
 def replaced(*places: tuple[str, str, Any]) -> Iterator[None]:
-    """Put something else in some places while the block runs; see ``PLACES``."""
+    """Replace names in modules while the block runs; see ``PLACES``."""
     with ExitStack() as stack:
         for module, name, instead in places:
             importlib.import_module(module)
