@@ -22,7 +22,7 @@ class DataCommandConfig(Common):
     """Settings of ``experiments.data`` itself, without a subcommand."""
 
     what: tyro.conf.Positional[str] = ""
-    """The subcommand: import (make a dataset of logs), export (write a dataset in another format), check
+    """The subcommand: import (convert logs to a dataset), export (write a dataset in another format), check
     (find faults in a dataset) or info (describe a dataset); each has its own --help."""
 
 

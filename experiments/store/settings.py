@@ -157,7 +157,7 @@ class PretrainConfig(Joined):
     resume: bool = False
     """Continue an interrupted run from its latest checkpoint, bit for bit."""
     dry_run: bool = False
-    """Print what would be done and examples of the CPU time it takes, then exit."""
+    """Print what would be done and roughly how much CPU time it would take, then exit."""
     tb: bool = False
     """Also log metrics to TensorBoard (extra: tb)."""
     wandb: bool = False
@@ -529,7 +529,7 @@ class AdaptConfig(Joined):
     json: bool = False
     """Print the summary as JSON."""
     dry_run: bool = False
-    """Print what would be done and examples of the CPU time it takes, then exit."""
+    """Print what would be done and roughly how much CPU time it would take, then exit."""
     resume: bool = False
     """Continue an interrupted adaptation; the result is the same as that of an uninterrupted one."""
     hyper: Annotated[Any, tyro.conf.arg(name="")] = field(default_factory=NoHyper)
