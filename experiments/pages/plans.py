@@ -88,9 +88,7 @@ def _map_arrays(results: Results, adapter: Adapter) -> Arrays:
     spec = results.environment.spec
 
     def read(state: MapState) -> Any:
-        key = jax.random.key(
-            0
-        )  # of several ways that are equally short it chooses the same every time
+        key = jax.random.key(0)  # fixed, so that the same of several shortest paths is chosen
         goal = find_state(state.table, state.task_goal)
         way = way_to(key, state.table, state.start, goal, spec.horizon)
         states = jnp.where(way.steps < FAR, way.states, UNKNOWN)
