@@ -218,9 +218,8 @@ class Converter:
             self.num_cut += 1
         if num < 1 or len(obs) != num + 1:
             raise BadEpisodeError(
-                f"{who} has {len(obs)} observations and {len(actions)} actions; an episode of T "
-                f"actions needs "
-                "T + 1 observations"
+                f"{who} has {len(obs)} observations and {len(actions)} actions; an episode of T actions "
+                "needs T + 1 observations"
             )
         obs = suited(obs, who, "observations")
         rows: Rows = {"obs": obs[:num], "actions": self.actions(actions[:num], who)}
@@ -270,8 +269,8 @@ class Converter:
         rows = actions.reshape(len(actions), -1).astype(np.float32)
         if len(low) > 1 and len(low) != rows.shape[1]:
             raise UsageError(
-                f"--action-low has {len(low)} numbers, an action has {rows.shape[1]}; give one, or "
-                f"one for each"
+                f"--action-low has {len(low)} numbers, an action has {rows.shape[1]}; give one, or one "
+                "for each"
             )
         if len(low):
             rows = (2 * (rows - low) / (high - low) - 1).astype(np.float32)
@@ -298,10 +297,9 @@ class Converter:
         elif "achieved_goals" not in found:
             size = int(np.prod(obs.shape[1:]))
             raise UsageError(
-                f"nothing says what a goal is; give --goal-columns with some of the {size} "
-                f"components of an "
-                f"observation, --goal-array with one of {printable(', '.join(sorted(arrays)))}, or --goal "
-                "module:function"
+                f"nothing says what a goal is; give --goal-columns with some of the {size} components of "
+                f"an observation, --goal-array with one of {printable(', '.join(sorted(arrays)))}, or "
+                "--goal module:function"
             )
         if "achieved_goals" not in found:
             goals = self._achieved(who, arrays, obs, num)
@@ -344,9 +342,8 @@ class Converter:
         rows = (num + 1,) if config.goal_array else (num + 1, num)
         if goals.dtype.kind not in "biuf" or goals.ndim != 2 or len(goals) not in rows:
             raise DataError(
-                f"{who}: {what} gives {goals.dtype}{list(goals.shape)}, wanted numbers [{num + 1}, "
-                f"G]: a goal "
-                "for every observation, the last one included"
+                f"{who}: {what} gives {goals.dtype}{list(goals.shape)}, wanted numbers [{num + 1}, G]: a "
+                "goal for every observation, the last one included"
             )
         return goals.astype(np.float32)
 
@@ -411,8 +408,8 @@ def import_dataset(config: ImportConfig) -> str:
     ]
     if converter.num_cut:
         said.append(
-            f"  {converter.num_cut} episodes have no observation after their last action, which "
-            f"was left out"
+            f"  {converter.num_cut} episodes have no observation after their last action, which was left "
+            "out"
         )
     said += [f"  left out: {printable(text)}" for text in skipped[:5]]
     if len(skipped) > 5:

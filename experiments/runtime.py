@@ -264,7 +264,7 @@ def explained(error: BaseException, config: Any = None) -> str:
 
 
 def _flag_of(config: Any, path: Any) -> str:
-    """The flag whose value a path begins with, as the start of a message; empty if there is none."""
+    """The flag whose value a path begins with, as ``OUT.partial`` does; empty if there is none."""
     for name, value in (vars(config) if config is not None else {}).items():
         if isinstance(value, Path) and str(path).startswith(str(value)):
             return f"{flag(name)}: "

@@ -126,9 +126,8 @@ def _wrong_observations(dataset: Dataset, found: Findings) -> None:
     """Find observations that belong to the previous episode, and missing last observations."""
     if dataset.last_obs is None:
         found.faults["last observation"].append(
-            f"trajectory 0, step {dataset.lengths[0]}: there is no observation after the last "
-            f"action, nor in "
-            "any other trajectory; an episode of T actions needs T + 1 observations"
+            f"trajectory 0, step {dataset.lengths[0]}: there is no observation after the last action, "
+            "nor in any other trajectory; an episode of T actions needs T + 1 observations"
         )
         return
     num, starts = len(dataset), dataset.starts
@@ -152,9 +151,9 @@ def _wrong_observations(dataset: Dataset, found: Findings) -> None:
         moved |= bool((rows[1:] != rows[:-1]).any())
     if num > 1 and repeated.all() and moved:
         found.faults["last observation"].append(
-            f"trajectory 0, step {dataset.lengths[0]}: the observation after the last action "
-            f"repeats the one "
-            f"before it, as in all {num} trajectories; T observations were logged where T + 1 are needed"
+            f"trajectory 0, step {dataset.lengths[0]}: the observation after the last action repeats the "
+            f"one before it, as in all {num} trajectories; T observations were logged where T + 1 are "
+            "needed"
         )
 
 
@@ -256,16 +255,15 @@ def _wrong_ends(dataset: Dataset, horizon: int, found: Findings) -> None:
         for index in np.flatnonzero(ended).tolist():
             found.faults["time limits"].append(
                 f"trajectory {index}, step {horizon - 1}: it is marked as terminated at the very "
-                f"horizon, as "
-                f"{ended.sum()} of {at_horizon.sum()} of this length are; a time limit is a truncation"
+                f"horizon, as {ended.sum()} of {at_horizon.sum()} of this length are; a time limit is a "
+                "truncation"
             )
     early = dataset.truncated & ~dataset.terminated & (lengths < horizon)
     if early.any() and (dataset.truncated & at_horizon).any():
         index = int(np.argmax(early))
         found.notes["cut early"].append(
             f"trajectory {index}, step {lengths[index] - 1}: it is marked as truncated before the "
-            f"horizon of "
-            f"{horizon}, as {early.sum()} are; an end of the task is a termination"
+            f"horizon of {horizon}, as {early.sum()} are; an end of the task is a termination"
         )
 
 

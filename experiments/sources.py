@@ -244,9 +244,8 @@ def _ends(arrays: Mapping[str, Any], num_steps: int, path: Path) -> np.ndarray:
     flags = [first_of(names, arrays) for names in (TERMINATED, TRUNCATED)]
     if all(flag is None for flag in flags):
         raise DataError(
-            f"{path} has neither terminals, timeouts nor lengths, so that nobody can tell where "
-            f"its episodes "
-            "end; add an array lengths with the number of actions of every episode"
+            f"{path} has neither terminals, timeouts nor lengths, so that nobody can tell where its "
+            "episodes end; add an array lengths with the number of actions of every episode"
         )
     over = np.zeros(num_steps, bool)
     for flag in flags:
@@ -254,9 +253,8 @@ def _ends(arrays: Mapping[str, Any], num_steps: int, path: Path) -> np.ndarray:
             rows = np.asarray(flag).reshape(-1)
             if len(rows) != num_steps:
                 raise DataError(
-                    f"{path}: terminals and timeouts must have a row for each of {num_steps} "
-                    f"actions, found "
-                    f"{len(rows)}"
+                    f"{path}: terminals and timeouts must have a row for each of {num_steps} actions, "
+                    f"found {len(rows)}"
                 )
             over |= rows.astype(bool)
     over[-1:] = True  # steps after the last end are an unfinished episode
@@ -268,9 +266,8 @@ def _files(path: Path) -> list[Path]:
     files = sorted(file for file in path.iterdir() if file.suffix in (".npz", ".parquet"))
     if not files:
         raise UsageError(
-            f"{path} holds neither npz nor parquet files, nor a folder data as Minari datasets do; "
-            f"give the "
-            "folder of your logs"
+            f"{path} holds neither npz nor parquet files, nor a folder data as Minari datasets do; give "
+            "the folder of your logs"
         )
     return files
 

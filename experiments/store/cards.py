@@ -147,9 +147,6 @@ def card(run: Finished) -> str:
         facts="\n".join(f"| {name} | {text} |" for name, text in facts.items()),
         watched=run.kind.watched,
         files=goals + tasks,
-        goals=", `goals.npz` (a sample of the goals\nof the training)"
-        if run.policy.seen_goals
-        else "",
         where="on them" if tested else "of the methods that use it",
         trajectories=settings.data.trajectories,
         demonstrator=find_demonstrator(run.world, env, settings.data.demonstrator)[0],
