@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -73,3 +74,36 @@ def test_the_kitchen_pays_in_turn() -> None:
     _, told = kitchen.step(state, jnp.zeros(9))
     assert not told.goal_reached
     assert told.reward == 0
+
+
+def test_a_place_far_from_the_start_is_told_from_near_ones() -> None:
+    pytest.importorskip("craftax")
+    places = importlib.import_module("examples.crafter_places")
+    iron = places.Achievement.COLLECT_IRON
+    rows = np.zeros((4, places.NUM_ACHIEVEMENTS + 3), np.float32)
+    rows[:3, iron.value] = 1
+    rows[2, places.Achievement.COLLECT_COAL.value] = 1  # both at once
+    known, cells = places.NUM_ACHIEVEMENTS, slice(places.NUM_ACHIEVEMENTS + 1, None)
+    rows[:, known] = 1
+    rows[:, cells] = np.array([[1, 2], [-20, 4], [9, -3], [30, 30]]) / places.PLACE_UNIT
+
+    class Found:
+        returns = np.zeros((1, 1, 2))
+
+        def reached_in(self, seed: int, task: int, episode: int) -> tuple[np.ndarray, np.ndarray]:
+            return np.arange(2), rows[2 * episode : 2 * episode + 2]
+
+    goal = places.rare_goal(Found(), 0, iron)
+    assert goal[: places.NUM_ACHIEVEMENTS].sum() == goal[iron.value] == 1
+    np.testing.assert_allclose(goal[cells] * places.PLACE_UNIT, [9, -3])
+    assert places.rare_goal(Found(), 0, places.Achievement.COLLECT_DIAMOND) is None
+    np.testing.assert_allclose(places.mirrored(goal[None])[0, cells] * places.PLACE_UNIT, [-9, 3])
+
+    # One episode unlocks it a step away from the place, one elsewhere, one never.
+    achieved = np.zeros((3, 5, len(goal)), np.float32)
+    achieved[0, 2] = goal
+    achieved[0, 2, cells] += np.array([1, 0]) / places.PLACE_UNIT
+    achieved[1, 4] = rows[1]
+    trajectory = SimpleNamespace(goal_reached=achieved.any(axis=-1), achieved_goals=achieved)
+    found = places.arrivals(SimpleNamespace(trajectory=trajectory), goal)
+    np.testing.assert_allclose(found, (1 / 3, 2 / 3))
