@@ -1,5 +1,7 @@
-"""The worlds: ``envs.make("maze15")`` builds one, ``envs.names()`` lists them, and
-``envs.check_world(world)`` checks one of your own.
+"""The worlds.
+
+``envs.make("maze15")`` builds one, ``envs.names()`` lists them, and ``envs.check_world(world)`` checks one
+of your own.
 
 Importing this package does not import jax; the records of an episode are loaded when they are first used.
 """

@@ -229,8 +229,7 @@ class Episode(NamedTuple):
 
 @dataclass(frozen=True)
 class Environment:
-    """The base class of worlds. Instances are frozen and hashable, so that equal worlds share compiled
-    programs.
+    """The base class of worlds; frozen and hashable, so that equal worlds share compiled programs.
 
     A subclass must define ``spec``, ``sample_task``, ``task_goal``, ``reset`` and ``step``. All other
     methods have defaults that it may override.
@@ -279,8 +278,7 @@ class Environment:
 
     @property
     def goal_names(self) -> tuple[str, ...]:
-        """Names of the first components of a goal, if each stands for something that an episode achieves or
-        not (default: none).
+        """Names of the first components of a goal, if each is something to achieve (default: none).
 
         It was achieved if the component of the outcome is above 1/2. For judging episodes the fraction that
         achieved each of them is reported.

@@ -41,13 +41,12 @@ class Shapes(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class GymnasiumWorld:
-    """The description that turns a gymnasium environment into a world. All functions run on the host, with
-    numpy.
+    """The description that turns a gymnasium environment into a world.
 
-    Functions of a moment have access to the observation, the ``info``, the environment itself, and the
-    reward and the flags of the step (``envs.live.Moment``). If observations are those of a ``GoalEnv``,
-    dicts with ``observation``, ``achieved_goal`` and ``desired_goal``, none of these functions needs to be
-    given.
+    All functions run on the host, with numpy. Functions of a moment have access to the observation, the
+    ``info``, the environment itself, and the reward and the flags of the step (``envs.live.Moment``). If
+    observations are those of a ``GoalEnv``, dicts with ``observation``, ``achieved_goal`` and
+    ``desired_goal``, none of these functions needs to be given.
 
     Attributes:
       name: the name of the world.
@@ -227,7 +226,7 @@ class GymnasiumWorld:
     def drawn_options(self, seed: int) -> dict[str, np.ndarray]:
         """The options of the task with this seed, as arrays of 32 bits or booleans."""
         drawn = self.options(np.random.default_rng(seed)) if self.options else {}
-        return {name: _narrow(np.asarray(drawn[name])) for name in sorted(drawn)}
+        return {name: _to_32_bits(np.asarray(drawn[name])) for name in sorted(drawn)}
 
     @cached_property
     def _option_names(self) -> list[str]:
@@ -300,11 +299,11 @@ class GymnasiumWorld:
 
     def _observed(self, moment: Moment) -> np.ndarray:
         if self.observe is not None:
-            return _narrow(np.asarray(self.observe(moment)))
+            return _to_32_bits(np.asarray(self.observe(moment)))
         obs, space = moment.obs, moment.env.observation_space
         if isinstance(obs, Mapping) and "observation" in obs:
             obs, space = obs["observation"], space["observation"]
-        return _narrow(np.asarray(self._flat(obs, space)))
+        return _to_32_bits(np.asarray(self._flat(obs, space)))
 
     def _flat(self, obs: Any, space: Any) -> Any:
         """An observation as one array: boxes unchanged, discrete ones as one-hots, dicts concatenated."""
@@ -322,7 +321,7 @@ class GymnasiumWorld:
         )
 
 
-def _narrow(array: np.ndarray) -> np.ndarray:
+def _to_32_bits(array: np.ndarray) -> np.ndarray:
     """Convert an array to a dtype of at most 32 bits."""
     if array.dtype.kind == "f":
         return np.asarray(array, np.float32)

@@ -1,11 +1,10 @@
-"""A pool of live gymnasium environments on the host, looked up by the history of their episodes. No jax
-here.
+"""A pool of live gymnasium environments on the host, looked up by the history of their episodes.
 
-A program requests a step of an episode by the episode's *identity*: a hash of how it began, of the actions
-since, and of their results. If a live environment is in exactly that place, it is stepped. If there is
-none, because the program repeats an episode or takes another branch of it, a fresh environment is reset in
-the same way and the actions are replayed. If that leads elsewhere, the environment is not reproducible, and
-is rejected.
+Nothing here imports jax. A program requests a step of an episode by the episode's *identity*: a hash of how
+it began, of the actions since, and of their results. If a live environment is in exactly that place, it is
+stepped. If there is none, because the program repeats an episode or takes another branch of it, a fresh
+environment is reset in the same way and the actions are replayed. If that leads elsewhere, the environment
+is not reproducible, and is rejected.
 """
 
 from __future__ import annotations

@@ -409,14 +409,16 @@ def _check_shapes(
 ) -> None:
     """Raise for the first array whose shape does not match its field, given the sizes of named axes so
     far."""
-    known = {axis: _only(size) if isinstance(size, int) else size for axis, size in sizes.items()}
+    known = {
+        axis: _exact_range(size) if isinstance(size, int) else size for axis, size in sizes.items()
+    }
     for name, header in headers.items():
         if not _fits(header.shape, fields[name], known):
-            wanted = ", ".join(_described(axis, known) for axis in fields[name].shape)
+            wanted = ", ".join(_axis_text(axis, known) for axis in fields[name].shape)
             raise _FaultError(f": {name} has shape {list(header.shape)}, wanted [{wanted}]")
 
 
-def _only(size: int) -> range:
+def _exact_range(size: int) -> range:
     return range(size, size + 1)
 
 
@@ -426,14 +428,16 @@ def _fits(shape: Sequence[int], field: ArrayField, known: dict[str, range]) -> b
     if len(shape) < len(axes) or (len(shape) > len(axes) and ... not in field.shape):
         return False
     for axis, size in zip(axes, shape, strict=False):
-        if size not in (_only(axis) if isinstance(axis, int) else known.get(axis, _only(size))):
+        if size not in (
+            _exact_range(axis) if isinstance(axis, int) else known.get(axis, _exact_range(size))
+        ):
             return False
         if isinstance(axis, str):
-            known[axis] = _only(size)
+            known[axis] = _exact_range(size)
     return True
 
 
-def _described(axis: int | str | EllipsisType, known: Mapping[str, range]) -> str:
+def _axis_text(axis: int | str | EllipsisType, known: Mapping[str, range]) -> str:
     """An axis of a field as text for a message, with its size if that is known."""
     if not isinstance(axis, str):
         return "..." if isinstance(axis, EllipsisType) else str(axis)

@@ -128,7 +128,7 @@ def restore_state(
             found = {k: np.asarray(v) for k, v in _read(manager, step).items()}
             _check_hash(found)
         except Exception as error:  # Orbax raises many kinds for a damaged file
-            if isinstance(error, MemoryError) or _is_of_the_machine(error):
+            if isinstance(error, MemoryError) or _is_machine_error(error):
                 raise  # the file may be sound
             _set_aside(where, root.with_name(root.name + DAMAGED))
             manager.reload()  # otherwise it refuses to save steps before the removed one
@@ -188,7 +188,7 @@ def _check_hash(found: dict[str, np.ndarray]) -> None:
         raise ValueError("hash")
 
 
-def _is_of_the_machine(error: Exception) -> bool:
+def _is_machine_error(error: Exception) -> bool:
     """Whether reading failed because of the machine, rather than because of the contents of the files."""
     return isinstance(error, OSError) and not isinstance(error, FileNotFoundError | EOFError)
 

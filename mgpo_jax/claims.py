@@ -40,7 +40,7 @@ class Claim:
 
     def leave(self) -> None:
         """Remove the lock file, and the folders that were created if they are empty."""
-        if _is_at(self.folder / LOCK, self._descriptor):
+        if _is_still_at(self.folder / LOCK, self._descriptor):
             (self.folder / LOCK).unlink(missing_ok=True)
             with suppress(OSError):
                 for folder in (self.folder, *self._made):
@@ -102,7 +102,7 @@ def _try_to_hold(folder: Path, wait: bool) -> int | None:
         raise cannot_write(folder, error.strerror) from None
     try:
         _lock(descriptor, folder, wait)
-        if _is_at(folder / LOCK, descriptor):
+        if _is_still_at(folder / LOCK, descriptor):
             os.ftruncate(descriptor, 0)
             os.write(descriptor, f"{os.getpid()} on {socket.gethostname()}\n".encode())
             return descriptor
@@ -130,7 +130,7 @@ def _lock(descriptor: int, folder: Path, wait: bool) -> None:
             raise
 
 
-def _is_at(path: Path, descriptor: int) -> bool:
+def _is_still_at(path: Path, descriptor: int) -> bool:
     """Whether an open file is still the one at a path."""
     try:
         return os.path.samestat(os.stat(path), os.fstat(descriptor))

@@ -72,11 +72,11 @@ class Cells(nn.Module):
         token = numbers[..., num_coded:] @ kernel + bias
         codes, amounts = jnp.split(numbers[..., :num_coded], [layout.num_cells], axis=-1)
         token = _looked_up(token, self.param("cells", init, cells), digit_rows(codes, layout))
-        amounts = _whole(amounts, layout.max_count + 1)[..., None]
+        amounts = _rounded(amounts, layout.max_count + 1)[..., None]
         return _looked_up(token, self.param("counts", init, counts), amounts)
 
 
-def _whole(numbers: Float[Array, "..."], size: int) -> Int[Array, "..."]:
+def _rounded(numbers: Float[Array, "..."], size: int) -> Int[Array, "..."]:
     """The nearest integers from 0 to ``size`` - 1."""
     return jnp.clip(jnp.round(numbers), 0, size - 1).astype(jnp.int32)
 
@@ -85,7 +85,7 @@ def digit_rows(codes: Float[Array, "... C"], layout: ObsLayout) -> Int[Array, ".
     """The row of a cell's table for each digit of its code; the rows of one digit follow those of the
     last."""
     sizes = np.array(layout.code_sizes, np.int32)
-    whole = _whole(codes, math.prod(layout.code_sizes))[..., None]
+    whole = _rounded(codes, math.prod(layout.code_sizes))[..., None]
     return whole // (np.cumprod(sizes) // sizes) % sizes + (np.cumsum(sizes) - sizes)
 
 

@@ -1,5 +1,4 @@
-"""A journal of finished pieces of long work on disk, so that it can be resumed after the process was
-killed.
+"""A journal of finished pieces of long work on disk, from which a killed process can be resumed.
 
 If several processes work together, process 0 keeps the records and sends the others what it reads.
 """

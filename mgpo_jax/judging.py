@@ -73,7 +73,7 @@ def evaluate_fully(
       DataError: if the policy was trained for another world, or a return is not finite.
     """
     run = partial(_measurement, num_episodes=episodes)
-    return _of_queries(run, env, policy, tasks, queries, seed)
+    return _run_queries(run, env, policy, tasks, queries, seed)
 
 
 class Uncertainty(NamedTuple):
@@ -104,7 +104,7 @@ def uncertainty(
     Raises:
       DataError: if the policy was trained for another world, or a return is not finite.
     """
-    return _of_queries(_uncertainty, env, policy, tasks, queries, seed)
+    return _run_queries(_uncertainty, env, policy, tasks, queries, seed)
 
 
 @cache
@@ -129,7 +129,7 @@ def _uncertainty(env: Environment, network: TransformerConfig, layout: Layout) -
     return over_lanes(env, layout, measure)
 
 
-def _of_queries(
+def _run_queries(
     program: Callable,
     env: Environment,
     policy: LoadedPolicy,

@@ -22,7 +22,7 @@ MULTI_GOAL = "mgpo"
 """The kind of the paper's policy, which follows prompts."""
 
 
-def _as_it_is(config: Any, env: Any, dataset: Any) -> Any:
+def _unchanged(config: Any, env: Any, dataset: Any) -> Any:
     del env, dataset
     return config
 
@@ -50,7 +50,7 @@ class Learned:
     config: type[NetworkConfig]
     init: Callable[[Any, Any], Any]
     loss: Callable[..., Any]
-    complete: Callable[[Any, Any, Any], Any] = _as_it_is
+    complete: Callable[[Any, Any, Any], Any] = _unchanged
     agent: Callable[[Any, Any, Any], Agent] | None = None
     facts: Callable[[Any], Mapping[str, str]] = lambda config: {"network": "of its own kind"}
     fault: Callable[[Any], str | None] = lambda config: None

@@ -1,5 +1,4 @@
-"""The ``manifest.json`` of a dataset, and the facts known about a dataset before it is read. Imports no
-jax.
+"""The ``manifest.json`` of a dataset, and the facts about a dataset before it is read. Imports no jax.
 
 There are two formats on disk. Data collected from a demonstrator are packed in ``trajectories.npz``,
 compressed. Imported data have an uncompressed file ``NAME.npy`` for each array, which is mapped into memory

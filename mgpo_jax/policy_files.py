@@ -66,11 +66,10 @@ def save_policy(
     made: dict[str, Any],
     seen_goals: SeenGoals | None = None,
 ) -> None:
-    """Write a policy to a folder; a policy that is there is replaced, and other files in the folder are
-    kept.
+    """Write a policy to a folder.
 
-    The replacement is atomic: however the process ends, the folder holds either the old policy or the new
-    one.
+    A policy that is there is replaced, and other files in the folder are kept. The replacement is atomic:
+    however the process ends, the folder holds either the old policy or the new one.
 
     Args:
       folder: the folder of the policy.

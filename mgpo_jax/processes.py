@@ -91,8 +91,7 @@ class Team:
             reader.start()
 
     def combine(self, piece: bytes, make: Callable[[list[bytes]], bytes]) -> bytes:
-        """Apply ``make`` in process 0 to the pieces of all processes, in order; returns the result in all
-        of them.
+        """Apply ``make`` in process 0 to the pieces of all processes, in order, and broadcast the result.
 
         Every process must call this.
         """
@@ -153,11 +152,11 @@ class Team:
                 if kind in (_PIECE, _DONE):
                     self._pieces[number].put(text)
                 else:
-                    self._pass_on(kind, source, text)
+                    self._forward(kind, source, text)
         if not self._leaving and number not in self._done:
-            self._pass_on(_GONE, number, b"")
+            self._forward(_GONE, number, b"")
 
-    def _pass_on(self, kind: bytes, source: int, text: bytes) -> None:
+    def _forward(self, kind: bytes, source: int, text: bytes) -> None:
         if not self.index:
             for number in self._links:
                 if number != source:
@@ -221,7 +220,7 @@ class Door:
                         f"{MEETING:.0f} s; see whether the network lets it"
                     ) from None
                 if secrets.compare_digest(said[:-4], self.password):
-                    links[struct.unpack(">I", said[-4:])[0]] = _kept_alive(link)
+                    links[struct.unpack(">I", said[-4:])[0]] = _with_keepalive(link)
                 else:
                     link.close()
         return links
@@ -238,13 +237,13 @@ def connected(places: Sequence[str], port: int, password: bytes, index: int) -> 
         try:
             link = socket.create_connection((place, port), timeout=MEETING)
             link.sendall(password + struct.pack(">I", index))
-            return _kept_alive(link)
+            return _with_keepalive(link)
         except OSError as error:
             fault = f"{place}:{port}: {error}"
     raise DataError(f"process 0 cannot be reached at {fault}; see whether the network lets it")
 
 
-def _kept_alive(link: socket.socket) -> socket.socket:
+def _with_keepalive(link: socket.socket) -> socket.socket:
     """Enable keepalive on a connection, so that it ends soon after the host at its other end is gone."""
     link.settimeout(None)
     link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -316,8 +315,7 @@ def exchange(piece: bytes) -> list[bytes]:
 
 
 def combined(piece: bytes, make: Callable[[list[bytes]], bytes]) -> bytes:
-    """Apply ``make`` in process 0 to the pieces of all processes, in order; returns the result in all of
-    them.
+    """Apply ``make`` in process 0 to the pieces of all processes, in order, and broadcast the result.
 
     Every process must call this. Only process 0 calls ``make``, which may use data that only process 0 has.
     """

@@ -365,7 +365,7 @@ def _run(run: Run, journal: Journal) -> tuple[Record, float]:
             if watched:
                 _check_sound(state.search, run, before + num)
             done.append(Segment(log, judged, cpu))
-            _keep(journal, number, done[-1], state, grid)
+            _save_segment(journal, number, done[-1], state, grid)
             progress.update(num * per_round)
             progress.show({"return": f"{judged.return_.mean():.3f}"})
             before += num
@@ -427,7 +427,7 @@ def _check_sound(searches: Any, run: Run, rounds: int) -> None:
         )
 
 
-def _keep(journal: Journal, number: int, segment: Segment, state: Any, grid: Grid) -> None:
+def _save_segment(journal: Journal, number: int, segment: Segment, state: Any, grid: Grid) -> None:
     """Write a finished segment to the journal, and then the state from which the next segment starts."""
     if not journal.keeps:
         return

@@ -78,8 +78,7 @@ def seen_in(dataset: Dataset, before: SeenGoals | None = None) -> SeenGoals:
 
 
 def covering(goals: Float[np.ndarray, "M G"]) -> SeenGoals:
-    """Choose at most 1,024 of M goals that cover all of them: each is the goal farthest from those before
-    it.
+    """Choose at most 1,024 of M goals that cover all of them, each the farthest from those before it.
 
     A goal counts as far from the sample if it is farther away than the least well covered one of ``goals``,
     and farther than half the smallest distance between two goals of the sample. The second condition

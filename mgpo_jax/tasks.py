@@ -68,8 +68,7 @@ def evaluation_tasks(
     tested: Environment | None = None,
     seed: int = 0,
 ) -> Task:
-    """Validation tasks, for evaluation during training and for choosing settings; none of them is a test
-    task.
+    """Validation tasks, for evaluation during training and for choosing settings; none is a test task.
 
     Args:
       env: the world of the tasks.
@@ -141,7 +140,7 @@ def load_tasks(path: Path, env: Environment) -> Task:
     if not path.is_file():
         raise UsageError(f"no task file {path}; name an npz file of tasks with --tasks")
     fields = task_fields(env)
-    tasks = _checked(read_arrays(path, fields, NUM_TASKS, _needs(env, fields)), env, path)
+    tasks = _checked(read_arrays(path, fields, NUM_TASKS, _required_arrays(env, fields)), env, path)
     try:
         env.check_solvable(tasks)
     except ValueError as error:
@@ -164,11 +163,11 @@ def tasks_from(
       DataError: if an array is missing or a task is invalid; the message begins with ``where``.
     """
     fields = task_fields(env)
-    fitted = fitted_arrays(arrays, fields, where, NUM_TASKS, _needs(env, fields))
+    fitted = fitted_arrays(arrays, fields, where, NUM_TASKS, _required_arrays(env, fields))
     return _assembled(fitted, env) if trusted else _checked(fitted, env, where)
 
 
-def _needs(env: Environment, fields: Mapping[str, ArrayField]) -> str:
+def _required_arrays(env: Environment, fields: Mapping[str, ArrayField]) -> str:
     return f"tasks of {env.spec.name} need the arrays {', '.join(fields)}"
 
 

@@ -312,8 +312,7 @@ class _Accumulator:
     def sums(
         self, weights: Array, parts: Iterator[tuple[Any, Trajectory]], asked: int
     ) -> list[Any]:
-        """Rows of ``(gradient vector, Stats)``, summed over ``(keys, part)`` pairs; the caller adds up the
-        rows.
+        """Sums of ``(gradient vector, Stats)`` over ``(keys, part)`` pairs, in rows to be added up.
 
         If several processes train together, the rows also hold whether this one has been asked to stop.
         """

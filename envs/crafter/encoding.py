@@ -1,5 +1,4 @@
-"""The encoder ``crafter-picture``: a linear layer on Crafter's picture, computed without drawing the
-picture.
+"""The encoder ``crafter-picture``: a linear layer on Crafter's picture, computed without drawing it.
 
 A picture consists of a tile for each cell and an icon for each item, all at fixed places. The output of a
 linear layer is therefore a sum over tiles at their places, whose terms are looked up in tables. Night mixes

@@ -1,5 +1,4 @@
-"""The demonstrator's decisions in Crafter: from its knowledge to an errand, and from an errand to an
-action.
+"""The demonstrator's decisions in Crafter: from its knowledge to an errand, and from that to an action.
 
 For each achievement the recipes determine the next errand (``Errand``): go to some kind of place and act
 there. Which errand to run is decided anew at every step. A zombie nearby is fought first, then a shelter is
@@ -371,8 +370,7 @@ def in_danger(scene: Scene) -> Bool[Array, ""]:
 
 
 def advances(scene: Scene) -> Float[Array, "22"]:
-    """The number of tiers by which each achievement comes earlier than in its order, in the current
-    situation.
+    """The number of tiers by which each achievement currently comes earlier than in its order.
 
     An achievement that depends on luck, such as meeting a cow, comes later while its object is not in view.
     """

@@ -115,13 +115,14 @@ def _do(key: PRNGKeyArray, world: EnvState, action: Int[Array, ""]) -> EnvState:
             wood_sword=bag.wood_sword, stone_sword=bag.stone_sword, iron_sword=bag.iron_sword
         ),
         player_hunger=jnp.where(ate_plant, world.player_hunger, after.player_hunger),
-        zombies=_only(after.zombies, world.zombies.mask),
-        cows=_only(after.cows, world.cows.mask),
-        skeletons=_only(after.skeletons, world.skeletons.mask),
+        zombies=_restricted(after.zombies, world.zombies.mask),
+        cows=_restricted(after.cows, world.cows.mask),
+        skeletons=_restricted(after.skeletons, world.skeletons.mask),
     )
 
 
-def _only(mobs: Mobs, alive: Bool[Array, "M"]) -> Mobs:
+def _restricted(mobs: Mobs, alive: Bool[Array, "M"]) -> Mobs:
+    """The mobs without those that were not ``alive`` before."""
     return mobs.replace(mask=mobs.mask & alive)
 
 

@@ -175,12 +175,11 @@ def scripted_arm(env: Kitchen, noise: float = NOISE) -> Agent:
 
 
 def kitchen_demonstrators(env: Kitchen) -> dict[str, Demonstrator]:
-    """The demonstrators of a kitchen, by name. All demonstrate every ordered task in turn (paper: 300
-    tasks, 30 episodes each).
+    """The demonstrators of a kitchen, by name.
 
-    ``expert`` demonstrates in both scenes, with randomized physics in the reduced one. The others
-    demonstrate in one unmodified scene with one engine. In the worlds of MJX and of the stock scene their
-    own demonstrator comes first.
+    All demonstrate every ordered task in turn (paper: 300 tasks, 30 episodes each). ``expert`` demonstrates
+    in both scenes, with randomized physics in the reduced one. The others demonstrate in one unmodified
+    scene with one engine. In the worlds of MJX and of the stock scene their own demonstrator comes first.
     """
     import_mujoco()  # raises errors now rather than while a program is traced
     engine = "native" if env.backend == "native" else "auto"

@@ -47,7 +47,7 @@ def franka_kitchen(horizon: int, **changes: Any) -> Any:
       changes: settings of FrankaKitchen to add or to override.
     """
     import_mujoco()
-    gymnasium = _mended_gymnasium()
+    gymnasium = _patched_gymnasium()
     settings = {
         "tasks_to_complete": list(SUBTASKS),
         "remove_task_when_completed": True,
@@ -61,7 +61,7 @@ def franka_kitchen(horizon: int, **changes: Any) -> Any:
     )
 
 
-def _mended_gymnasium() -> Any:
+def _patched_gymnasium() -> Any:
     """gymnasium with the environments of gymnasium-robotics 1.4.2, patched for mujoco 3.17.
 
     ``robot_get_obs`` of gymnasium-robotics asserts that the type of a joint, a numpy integer, is in a tuple

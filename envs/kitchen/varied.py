@@ -140,7 +140,7 @@ def draw_variation(key: PRNGKeyArray, stock_share: float = STOCK_SHARE) -> Varia
 
 def start_of(variation: Variation) -> VariedState:
     """The physics state at the start of an episode, at rest."""
-    reduced, stock = (_start_in_the_full_scene(name) for name in MODELS)
+    reduced, stock = (_initial_positions(name) for name in MODELS)
     is_stock = variation.scene == MODELS.index("stock")
     shift = jnp.where(is_stock, 0.0, variation.start)
     rest = jnp.asarray(initial_state("stock").qvel)
@@ -153,7 +153,7 @@ def start_of(variation: Variation) -> VariedState:
 
 
 @cache
-def _start_in_the_full_scene(name: str) -> Float[np.ndarray, "30"]:
+def _initial_positions(name: str) -> Float[np.ndarray, "30"]:
     """The initial positions of a model's episodes, in the coordinates of the full scene."""
     return np.asarray(scene_coordinates(name)[0].expand(initial_state(name).qpos))
 

@@ -94,7 +94,7 @@ class CommandedTransformer(GoalTransformer):
         """
         slots, stride, time = self.config.max_prompt_length, self.config.tokens_per_step, len(obs)
         times = self.embed_time[:time]
-        nothing = self._nothing()
+        nothing = self._empty_prompt()
         history = [self._prompt_tokens(nothing), self._step_tokens(obs, actions, times)]
         queries = self.embed_goal(commands) + times
         seen = self._seen(nothing, len(history[1]))
@@ -108,7 +108,7 @@ class CommandedTransformer(GoalTransformer):
 
     def begin(self, obs: Shaped[Array, "..."]) -> tuple[Float[Array, "E"], KVCache]:
         """Read the first observation; returns the features there and the cache."""
-        features, cache = self._first(self._nothing(), obs)
+        features, cache = self._first(self._empty_prompt(), obs)
         return features[-1], cache
 
     def proceed(
@@ -137,7 +137,7 @@ class CommandedTransformer(GoalTransformer):
         token: Array = self.embed_obs(self.config.standardized(obs[None]))
         return token[0]
 
-    def _nothing(self) -> Prompt:
+    def _empty_prompt(self) -> Prompt:
         """The empty prompt."""
         slots = self.config.max_prompt_length
         return Prompt(jnp.zeros((slots, self.config.goal_dim)), jnp.zeros(slots, bool))

@@ -178,7 +178,7 @@ class Finetuner:
         loss_of = self.how.loss(batch)
 
         def loss(weights: Weights) -> tuple[Array, Array]:
-            now = self._passed(weights, batch)
+            now = self._forward(weights, batch)
             away = real_mean(now.actions.kl(batch.pretrained), batch.real)
             moved = real_mean(batch.before.kl(now.actions), batch.real)
             return loss_of(now, batch) + self.hyper.kl * away, moved
@@ -204,7 +204,7 @@ class Finetuner:
         trajectory = episodes.trajectory
         obs, actions = trajectory.obs, trajectory.actions
         merged = self.part.merge(state.weights.policy)
-        before, features = self._look(merged, query.prompt, obs, actions)
+        before, features = self._outputs(merged, query.prompt, obs, actions)
         return Batch(
             prompt=query.prompt,
             obs=obs,
@@ -212,11 +212,11 @@ class Finetuner:
             rewards=episodes.rewards,
             real=jnp.arange(actions.shape[1]) < trajectory.length[:, None],
             before=before,
-            pretrained=self._look(self.params, query.prompt, obs, actions)[0],
+            pretrained=self._outputs(self.params, query.prompt, obs, actions)[0],
             values=state.weights.value(features),
         )
 
-    def _look(
+    def _outputs(
         self, params: Any, prompt: Prompt, obs: Array, actions: Array
     ) -> tuple[Distribution, Array]:
         """Action distributions and features at all steps of K episodes."""
@@ -228,9 +228,9 @@ class Finetuner:
         seen: tuple[Distribution, Array] = jax.vmap(one)(obs, actions)
         return seen
 
-    def _passed(self, weights: Weights, batch: Batch) -> Pass:
+    def _forward(self, weights: Weights, batch: Batch) -> Pass:
         merged = self.part.merge(weights.policy)
-        actions, features = self._look(merged, batch.prompt, batch.obs, batch.actions)
+        actions, features = self._outputs(merged, batch.prompt, batch.obs, batch.actions)
         if not self.how.share_trunk:
             features = jax.lax.stop_gradient(features)
         return Pass(actions, weights.value(features))

@@ -220,8 +220,7 @@ class Carry(NamedTuple):
 
 
 def low_level(config: SkillConfig, params: Any, judged: Judgement) -> LowLevel:
-    """The decoder as the low level of a hierarchy; a decision is a latent, and a view an embedded
-    observation.
+    """The decoder as the low level; a decision is a latent, and a view an embedded observation.
 
     Args:
       config: the networks' config.

@@ -1,5 +1,4 @@
-"""SPiRL: soft actor-critic over pre-trained skills, regularized by their prior (paper, appendix F.2, Table
-9).
+"""SPiRL: soft actor-critic over pre-trained skills, near their prior (paper, appendix F.2, Table 9).
 
 Every k steps the high level samples a latent z, and the low level (``skills``) decodes it into actions. The
 high level is initialized with the prior p(z | o_t) and maximizes R - alpha KL(pi, p), where R is the

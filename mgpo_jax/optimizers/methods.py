@@ -112,19 +112,23 @@ def search_space(setting: Setting, hyper: PromptHyper) -> SearchSpace:
 
 
 def make_ucb(setting: Setting, params: Any, hyper: UcbHyper) -> Adapter:
-    return _lifted(setting, params, ucb(search_space(setting, hyper), c=hyper.c, scale=hyper.scale))
+    return _to_adapter(
+        setting, params, ucb(search_space(setting, hyper), c=hyper.c, scale=hyper.scale)
+    )
 
 
 def make_bpe(setting: Setting, params: Any, hyper: BpeHyper) -> Adapter:
-    return _lifted(setting, params, bpe(search_space(setting, hyper), min_std=hyper.min_std))
+    return _to_adapter(setting, params, bpe(search_space(setting, hyper), min_std=hyper.min_std))
 
 
 def make_explore(setting: Setting, params: Any, hyper: ExploreHyper) -> Adapter:
-    return _lifted(setting, params, explore(search_space(setting, hyper)))
+    return _to_adapter(setting, params, explore(search_space(setting, hyper)))
 
 
 def make_grips(setting: Setting, params: Any, hyper: GripsHyper) -> Adapter:
-    return _lifted(setting, params, grips(search_space(setting, hyper), num_edits=hyper.num_edits))
+    return _to_adapter(
+        setting, params, grips(search_space(setting, hyper), num_edits=hyper.num_edits)
+    )
 
 
 def make_bbt(setting: Setting, params: Any, hyper: BbtHyper) -> Adapter:
@@ -134,15 +138,15 @@ def make_bbt(setting: Setting, params: Any, hyper: BbtHyper) -> Adapter:
         latent_dim=hyper.latent_dim,
         std_init=hyper.std_init,
     )
-    return _lifted(setting, params, optimizer)
+    return _to_adapter(setting, params, optimizer)
 
 
 def make_gcbc(setting: Setting, params: Any, hyper: NoHyper) -> Adapter:
     del hyper
-    return _lifted(setting, params, fixed_prompt(setting.network.max_prompt_length))
+    return _to_adapter(setting, params, fixed_prompt(setting.network.max_prompt_length))
 
 
-def _lifted(setting: Setting, params: Any, optimizer: PromptOptimizer) -> Adapter:
+def _to_adapter(setting: Setting, params: Any, optimizer: PromptOptimizer) -> Adapter:
     return prompt_adapter(transformer_policy(setting.network, params), optimizer, setting.judged)
 
 

@@ -24,8 +24,7 @@ def choose_frontier(
     choices: Int[Array, "N"],
     known: Int[Array, ""],
 ) -> Int[Array, ""]:
-    """Choose the frontier to explore: a state with untried actions through which the task goal may be
-    nearest.
+    """Choose the frontier through which the task goal may be nearest: a state with untried actions.
 
     The number of steps from a state to the task goal is bounded from below by the distance between their
     goals, divided by the largest change of the goal in one step so far.

@@ -1,5 +1,4 @@
-"""``plan`` in worlds whose goals are states: a map of all episodes, paths in it, and prompts to follow
-them.
+"""``plan`` in worlds whose goals are states: a map, paths in it, and prompts to follow them.
 
 The first episode evaluates (g^M). Every later episode is spent on one of three things:
 

@@ -32,10 +32,10 @@ def random_prompts(
 def crossed(
     key: PRNGKeyArray, prompt: Prompt, other: Prompt, way: Goals, max_goals: int | Int[Array, ""]
 ) -> Prompt:
-    """Cross two prompts: the goals of the first up to a random place on the path, those of the other after
-    it.
+    """Cross two prompts at a random place on the path.
 
-    If that makes more than ``max_goals`` goals, the first ones are left out.
+    The result has the goals of the first prompt up to that place, and those of the other after it. If that
+    makes more than ``max_goals`` goals, the first ones are left out.
     """
     num_inner = len(prompt.mask) - 1
     cut = jax.random.randint(key, (), 0, jnp.maximum(way.length, 1))

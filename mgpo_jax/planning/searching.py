@@ -187,7 +187,7 @@ def search_prompts(
         index, pool = carry
         keys = jax.random.split(jax.random.fold_in(key_rounds, index), NUM_PROMPTS)
         children = jax.vmap(lambda key: _child(key, quest, pool))(keys)
-        return index + 1, _best(_joined(pool, quest.tried(children)))
+        return index + 1, _best(_concatenated(pool, quest.tried(children)))
 
     num_rounds, pool = jax.lax.while_loop(unfinished, change, (jnp.int32(0), pool))
     num, led = NUM_PROMPTS * (1 + num_rounds), memory.led
@@ -266,14 +266,14 @@ def _steered(
     tools, stride = quest.tools, quest.table.stride
     change = lambda key, prompt: quest.changed(key, prompt, pool.rehearsal.strays[0])  # noqa: E731
     own = jax.vmap(change)(jax.random.split(key, NUM_LED), led)
-    first = _joined(led, own, _rows(pool.prompts, NUM_LED), _rows(fresh, NUM_LED))
+    first = _concatenated(led, own, _rows(pool.prompts, NUM_LED), _rows(fresh, NUM_LED))
     chosen = jnp.argsort(deficits(tools.policy, lead, first))[:NUM_LED]
     first = jax.tree.map(lambda rows: rows[chosen], first)
     moved, _ = steer(tools.policy, lead, first, stride, tools.features.steering)
-    return _best(_joined(pool, quest.tried(moved))), moved
+    return _best(_concatenated(pool, quest.tried(moved))), moved
 
 
-def _joined(*trees: Any) -> Any:
+def _concatenated(*trees: Any) -> Any:
     """Concatenate the rows of pytrees."""
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *trees)
 

@@ -83,8 +83,7 @@ class _Steering(NamedTuple):
 def steer(
     policy: Policy, lead: Lead, prompts: Prompt, stride: Float[Array, ""], num_steps: int
 ) -> tuple[Prompt, Float[Array, "Q"]]:
-    """Optimize the goals of Q prompts, except for their last ones, by Adam on the loss of
-    ``deficit_and_loss``.
+    """Optimize the goals of Q prompts, except for their last ones, by Adam (``deficit_and_loss``).
 
     Args:
       policy: the policy that is to take the path. It must provide ``Policy.score``.
