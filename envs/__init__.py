@@ -1,7 +1,9 @@
-"""The worlds: ``envs.make("maze15")`` builds one, ``envs.names()`` lists them, and
-``envs.check_world(world)`` checks one of your own.
+"""The worlds.
 
-Importing this package imports no jax; the records of an episode are loaded when they are first used.
+``envs.make("maze15")`` builds one, ``envs.names()`` lists them, and ``envs.check_world(world)`` checks one
+of your own.
+
+Importing this package does not import jax; the records of an episode are loaded when they are first used.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""The records of an episode, and what a world has to offer.
+"""The records of an episode, and the interface of a world (environment).
 
-A world is a static spec and pure functions over traced tasks and states. Everything is written for one
-episode; ``jax.vmap`` adds the axes of batches, tasks and seeds.
+A world consists of a static spec and pure functions of traced tasks and states. Everything is written for
+one episode; ``jax.vmap`` adds the axes of batches, tasks and seeds.
 
 Axes in shapes: T time steps, D components of an observation, G components of a goal, A components of an
 action, N tasks.
@@ -26,7 +26,7 @@ State = Any  # a pytree of arrays
 
 @dataclass(frozen=True)
 class ArraySpec:
-    """Shape and dtype of an array without its content."""
+    """Shape and dtype of an array."""
 
     shape: tuple[int, ...]
     dtype: str = "float32"
@@ -59,17 +59,18 @@ class Box:
 
 @dataclass(frozen=True, kw_only=True)
 class ObsLayout:
-    """What the numbers of a flat observation are, where they are not all amounts.
+    """The meaning of the numbers in a flat observation, if some of them are categorical codes or counts.
 
-    First come the codes of ``num_cells`` cells, then ``num_counts`` counts, then numbers. The code of a
-    cell is made of digits d_0, d_1, .. below ``code_sizes``: it is d_0 + code_sizes[0] * (d_1 +
-    code_sizes[1] * (d_2 + ..)), as of what lies in the cell and who stands there.
+    The codes of ``num_cells`` cells come first, then ``num_counts`` counts, then plain numbers. The code of
+    a cell combines several digits d_0, d_1, .., such as the block in the cell and the creature on it. It is
+    d_0 + code_sizes[0] * (d_1 + code_sizes[1] * (d_2 + ..)).
 
     Attributes:
       num_cells: number of cells.
-      code_sizes: how many values each digit of a code has; a single size is for codes without digits.
+      code_sizes: number of values of each digit of a code; a single size if codes are not divided into
+        digits.
       num_counts: number of counts.
-      max_count: the largest count; counts are integers from 0 on.
+      max_count: the largest count; counts are integers from 0.
     """
 
     num_cells: int
@@ -80,24 +81,25 @@ class ObsLayout:
 
 @dataclass(frozen=True, kw_only=True)
 class EnvSpec:
-    """Static facts of a world.
+    """The static specification of a world.
 
     Attributes:
-      name: what messages and file names call the world.
+      name: the name of the world in messages and file names.
       obs: shape and dtype of an observation.
       goal_dim: size G of a goal.
-      actions: the space of actions.
+      actions: the action space.
       horizon: number of steps after which an episode is truncated.
-      return_range: smallest and largest possible return; the optimizers scale by it.
-      truncate_in_hindsight: whether a trajectory that is cut at any step is a trajectory to another
-        task goal (paper, appendix D: true in MazeRunner, where every position is a goal).
-      deterministic: whether task and actions determine an episode. If not, the return of one greedy
-        episode is only a sample of what a prompt is worth.
-      reward_confirms_goals: whether a reward at a goal says that this goal was the right one at this
+      return_range: smallest and largest possible return, by which optimizers scale returns.
+      truncate_in_hindsight: whether a trajectory that is cut at any step is a demonstration of another task
+        goal (paper, appendix D: true in MazeRunner, where every position is a goal).
+      deterministic: whether the task and the actions determine an episode. If not, the return of one greedy
+        episode is only a sample from the return distribution of a prompt.
+      reward_confirms_goals: whether a reward at a goal means that this goal was the right one at this
         point, as in worlds that reward a sequence part by part.
-      goals_are_states: whether the goal reached says in which state a task is, as far as a policy can
-        tell states apart. What was seen in several episodes then is one map.
-      layout: what the numbers of an observation are, for encoders that embed codes and counts [amounts].
+      goals_are_states: whether the achieved goal determines the state of a task, as far as a policy can
+        distinguish states. Then the observations of several episodes can be combined into one map.
+      layout: the meaning of an observation's numbers, for encoders that embed codes and counts [all are
+        plain numbers].
     """
 
     name: str
@@ -128,12 +130,12 @@ class EnvSpec:
 
 @dataclass(frozen=True)
 class Engine:
-    """How programs that hold steps of a world want to be run.
+    """Requirements of a world's simulation engine on the compiled programs that step it.
 
     Attributes:
-      worlds_together: how many worlds a step should advance at least, for engines whose calls are
-        expensive however few worlds they step.
-      compiler_options: XLA options, pairs of name and value, to compile such programs with.
+      worlds_together: smallest efficient batch of worlds in a step, for engines with a high overhead per
+        call.
+      compiler_options: XLA options for such programs, as pairs of name and value.
     """
 
     worlds_together: int = 1
@@ -141,26 +143,27 @@ class Engine:
 
 
 class TimeStep(NamedTuple):
-    """What the agent is told after a reset or a step."""
+    """The output of a world after a reset or a step."""
 
     obs: Shaped[Array, "..."]
     achieved_goal: Float[Array, "G"]
-    """The goal reached now, f_G(o_t) in section 2.1 of the paper."""
+    """The currently achieved goal, f_G(o_t) in section 2.1 of the paper."""
     goal_reached: Bool[Array, ""]
     """Whether ``achieved_goal`` counts as reached at this step (mazes: always; subtasks: on completion)."""
     outcome: Float[Array, "G"]
-    """The task goal that this episode would have in hindsight if it ended now."""
+    """The task goal that this episode would accomplish in hindsight if it ended now."""
     reward: Float[Array, ""]
     terminated: Bool[Array, ""]
     truncated: Bool[Array, ""]
     failed: Bool[Array, ""] | bool = False
-    """Whether the world broke down (diverged physics) and ended the episode because of that."""
+    """Whether the simulation failed (such as by diverging physics), which ends the episode."""
 
 
 class Goals(NamedTuple):
-    """The goals that an episode reached: all that prompts are drawn from.
+    """The goals that an episode reached, from which prompts are drawn.
 
-    Steps t < length are real, the others padding. Entries at ``t`` describe the world after action ``t``.
+    Steps t < length are real, the others are padding. Entries at ``t`` describe the world after action
+    ``t``.
     """
 
     achieved_goals: Float[Array, "*batch T G"]
@@ -170,10 +173,11 @@ class Goals(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """What an episode leaves behind for hindsight: the steps t < length are real, the others padding.
+    """The observations, actions and goals of an episode, padded to T steps.
 
-    ``obs[t]`` is what the agent saw before ``actions[t]``. ``achieved_goals[t]``, ``goal_reached[t]``
-    and ``outcomes[t]`` describe the world after it.
+    Steps t < length are real, the others are padding. ``obs[t]`` is the observation before ``actions[t]``,
+    while ``achieved_goals[t]``, ``goal_reached[t]`` and ``outcomes[t]`` describe the world after that
+    action.
     """
 
     obs: Shaped[Array, "..."]
@@ -185,19 +189,19 @@ class Trajectory(NamedTuple):
     outcomes: Float[Array, "*batch T G"]
     length: Int[Array, "*batch"]
     intended: Array | None = None
-    """What the agent intended where it executed ``actions``, in their shape and dtype, for agents that
-    tell it (``Agent.intended``)."""
+    """The actions that the agent intended when it executed ``actions``, with the same shape and dtype; None
+    for agents without ``Agent.intended``."""
 
     @property
     def steps(self) -> dict[str, Any]:
-        """The arrays that have a row for every step, by name, without those that are None."""
+        """The arrays with a row for every step, by name, without those that are None."""
         rows = {name: rows for name, rows in self._asdict().items() if name != "length"}
         return {name: array for name, array in rows.items() if array is not None}
 
     @property
     def labels(self) -> Any:
-        """What behavior cloning imitates: the intended actions, or the executed ones of an agent that
-        tells no others."""
+        """The targets of behavior cloning: the intended actions if they are known, otherwise the executed
+        ones."""
         return self.actions if self.intended is None else self.intended
 
     @property
@@ -216,19 +220,19 @@ class Episode(NamedTuple):
     last_obs: Shaped[Array, "..."]
     """The observation after the last action."""
     first_goal: Float[Array, "*batch G"] | tuple[()] = ()
-    """The goal that was reached at the start, before any action."""
+    """The achieved goal at the start, before any action."""
     failed: Bool[Array, "*batch"] | bool = False
-    """Whether the world broke down and ended the episode."""
+    """Whether the episode ended because the simulation failed."""
     decisions: Any = ()
-    """What the agent decided beside its actions (``Agent.decisions``)."""
+    """The agent's decisions besides its actions (``Agent.decisions``)."""
 
 
 @dataclass(frozen=True)
 class Environment:
-    """A world, to derive from. Frozen and hashable, so that equal worlds share one compiled program.
+    """The base class of worlds; frozen and hashable, so that equal worlds share compiled programs.
 
-    A world defines ``spec``, ``sample_task``, ``task_goal``, ``reset`` and ``step``. Everything else has
-    a default, which may be replaced by something better.
+    A subclass must define ``spec``, ``sample_task``, ``task_goal``, ``reset`` and ``step``. All other
+    methods have defaults that it may override.
     """
 
     @property
@@ -244,59 +248,57 @@ class Environment:
         raise NotImplementedError
 
     def reset(self, key: PRNGKeyArray, task: Task) -> tuple[State, TimeStep]:
-        """The start of an episode. All chance in the episode comes from ``key``."""
+        """Begin an episode. All randomness of the episode comes from ``key``."""
         raise NotImplementedError
 
     def step(self, state: State, action: Array) -> tuple[State, TimeStep]:
-        """One step. Terminal states absorb with reward 0; there is no auto-reset."""
+        """Take one step. Terminal states are absorbing, with reward 0; there is no auto-reset."""
         raise NotImplementedError
 
     @property
     def engine(self) -> Engine:
-        """How programs that hold steps of this world want to be run (default: in no special way)."""
+        """Requirements on compiled programs that step this world (default: none)."""
         return Engine()
 
     def optimal_return(self, task: Task) -> Float[Array, ""]:
-        """The best return that any policy can have on this task (default: NaN, which means unknown).
+        """The highest return that any policy can achieve on this task (default: NaN, which means unknown).
 
-        Where the optimum is unknown, no regret is computed, printed or stored.
+        If the optimum is unknown, no regret is computed, printed or stored.
         """
         del task
         return jnp.full((), jnp.nan)
 
     def solvable(self, task: Task) -> Bool[Array, ""]:
-        """Whether anyone could solve a valid task within the horizon (default: yes).
+        """Whether a valid task can be solved within the horizon (default: yes).
 
-        A task that nobody can solve is refused where a user brings it, and never counts as solved: see
-        ``check_solvable``.
+        An unsolvable task is rejected if a user brings it (``check_solvable``), and never counts as solved.
         """
         del task
         return jnp.ones((), bool)
 
     @property
     def goal_names(self) -> tuple[str, ...]:
-        """Names of the first components of a goal, where each stands for something that an episode achieves
-        or not (default: none).
+        """Names of the first components of a goal, if each is something to achieve (default: none).
 
-        A component of an outcome above 1/2 means that this was achieved. Judged episodes are then counted
-        by what they achieved.
+        It was achieved if the component of the outcome is above 1/2. For judging episodes the fraction that
+        achieved each of them is reported.
         """
         return ()
 
     def num_parts(self, task: Task) -> Int[Array, ""]:
-        """The number n of parts of this task that pay 1/n each when they are done in order.
+        """The number n of parts of this task, if each pays 1/n when they are completed in order.
 
-        The default is 0: the task is not rewarded part by part. Elsewhere the return of an episode times n
-        is the number of parts that were done.
+        The default is 0, for tasks that are not rewarded part by part. Otherwise the return of an episode
+        times n is the number of completed parts.
         """
         del task
         return jnp.zeros((), jnp.int32)
 
     def sample_goal(self, key: PRNGKeyArray) -> Float[Array, "G"]:
-        """A random goal that can stand in a prompt, drawn without knowledge of the task.
+        """A random goal for a prompt, drawn without knowledge of the task.
 
         Raises:
-          NotAvailableError: by default. Methods that insert random goals into prompts then cannot be used.
+          NotAvailableError: by default. Then methods that insert random goals into prompts cannot be used.
         """
         del key
         raise NotAvailableError(
@@ -305,23 +307,23 @@ class Environment:
 
     @property
     def goal_set(self) -> np.ndarray:
-        """The goals that an agent can be told to reach one at a time, [N, G].
+        """The N goals that an agent can be commanded to reach one at a time, [N, G].
 
         Raises:
-          NotAvailableError: by default. Methods that choose among goals then cannot be used.
+          NotAvailableError: by default. Then methods that choose among goals cannot be used.
         """
         raise NotAvailableError(
             f"{self.spec.name} has no list of goals to choose from (its class does not define goal_set)"
         )
 
     def expert_goal(self, state: State, num_steps: int) -> Float[Array, "G"]:
-        """The goal to go for from a state on, told by somebody who knows the task and everything else.
+        """The next goal to pursue, chosen by an expert with full knowledge of the task and the state.
 
-        It is what tells how good a hierarchy can be whose high level needs to learn nothing.
+        With these goals a hierarchy is evaluated without learning its high level, as an upper bound.
 
         Args:
-          state: of an episode in progress.
-          num_steps: number of steps until the next goal is told.
+          state: the state of an episode in progress.
+          num_steps: number of steps until the next goal is chosen.
 
         Raises:
           NotAvailableError: by default.
@@ -332,24 +334,25 @@ class Environment:
         )
 
     def fingerprint(self, task: Task) -> Int[Array, "F"]:
-        """What must differ between the tasks of training and test (default: all bytes of the task)."""
+        """The part of a task in which training and test tasks must differ (default: all bytes of the
+        task)."""
         leaves = [_without_key(jnp.asarray(leaf)) for leaf in jax.tree.leaves(task)]
         leaves = [leaf.astype(jnp.uint8) if leaf.dtype == bool else leaf for leaf in leaves]
         as_bytes = [jax.lax.bitcast_convert_type(leaf, jnp.uint8).ravel() for leaf in leaves]
         return jnp.concatenate(as_bytes).astype(jnp.int32)
 
     def check_task(self, tasks: Task) -> None:
-        """Raise ``ValueError`` with a sentence on what is wrong with N stacked tasks.
+        """Raise ``ValueError`` with a sentence about the first fault of N stacked tasks.
 
-        The default compares shapes and kinds of numbers with those of ``sample_task``, and refuses
-        numbers that are not finite. A world adds rules of its own, such as what the walls of a maze are.
+        The default compares shapes and kinds of numbers with those of ``sample_task``, and rejects numbers
+        that are not finite. A world adds its own rules, such as which values stand for the walls of a maze.
         """
         check_shapes(tasks, jax.eval_shape(self.sample_task, jax.random.key(0)))
 
     def check_solvable(self, tasks: Task) -> None:
-        """Raise ``ValueError`` with a sentence on the first of N stacked tasks that is not ``solvable``.
+        """Raise ``ValueError`` with a sentence about the first of N stacked tasks that is not ``solvable``.
 
-        The tasks are valid ones. A world may replace it by one that says why nobody can solve a task.
+        The tasks must be valid. A world may override this to say why a task cannot be solved.
         """
         can = np.asarray(jax.jit(jax.vmap(self.solvable))(jax.tree.map(jnp.asarray, tasks)))
         if not can.all():
@@ -360,18 +363,19 @@ class Environment:
 
 
 def _without_key(leaf: Array) -> Array:
-    """The raw data of random keys; any other array as it is."""
+    """The raw data of random keys; any other array unchanged."""
     is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
     return jax.random.key_data(leaf) if is_key else leaf
 
 
 def check_shapes(tasks: Task, example: Task) -> None:
-    """Raise ``ValueError`` for the first array of N stacked tasks that holds no tasks like ``example``."""
+    """Raise ``ValueError`` for the first array of N stacked tasks that does not match the task
+    ``example``."""
     paths, _ = jax.tree_util.tree_flatten_with_path(example)
     leaves = jax.tree.leaves(tasks)
     if len(leaves) != len(paths):
         raise ValueError(f"a task has {len(paths)} arrays, found {len(leaves)}")
-    num: int | None = None  # N, once the first array has told it
+    num: int | None = None  # N, which the first array determines
     for (path, like), leaf in zip(paths, leaves, strict=True):
         name, array = jax.tree_util.keystr(path, simple=True) or "the task", np.asarray(leaf)
         stacked = array.ndim == like.ndim + 1 and array.shape[1:] == like.shape
@@ -387,64 +391,66 @@ def check_shapes(tasks: Task, example: Task) -> None:
 
 
 def _kind(dtype: np.dtype) -> str:
-    """What arrays of this dtype hold, in a word for messages."""
+    """The kind of values in arrays of a dtype, as a word for messages."""
     kinds = {"b": "booleans", "i": "integers", "u": "integers", "f": "numbers"}
     return kinds.get(dtype.kind, str(dtype))
 
 
 def keeps_its_size(memory: Any, num_steps: int) -> Any:
-    """The memory of an agent that needs no more room as an episode goes on."""
+    """The ``grow`` of agents whose memory has a fixed size: returns the memory unchanged."""
     del num_steps
     return memory
 
 
 class Agent(NamedTuple):
-    """Whoever acts in an episode: a policy with its prompt, or a demonstrator of a dataset.
+    """An agent that acts in an episode, such as a policy under a prompt, or the demonstrator of a dataset.
 
     ``begin`` and ``proceed`` return ``(action, quits, memory)``. An agent that quits ends the episode
-    before the action.
+    before the action is taken.
     """
 
     begin: Callable
-    """``(key, task, state, timestep)`` at the start of an episode."""
+    """``(key, task, state, timestep) -> (action, quits, memory)`` at the start of an episode."""
     proceed: Callable
-    """``(key, memory, state, timestep)`` after every step."""
+    """``(key, memory, state, timestep) -> (action, quits, memory)`` after every step."""
     grow: Callable = keeps_its_size
     """``(memory, num_steps) -> memory`` with room for that many more steps."""
     decisions: Callable = lambda memory: ()
-    """``(memory) -> decisions``: what it decided in the episode beside its actions, for agents whose
-    decisions last several steps. It is asked when all episodes of a batch have ended, and until then an
-    agent acts on: keep decisions by the step they were made in, of which the first ``length`` count."""
+    """``(memory) -> decisions``: the decisions of the episode besides its actions, for agents whose
+    decisions last several steps. It is called once all episodes of a batch have ended. Until then the agent
+    continues to act, so it must store decisions by their step; those of the first ``length`` steps
+    count."""
     intended: Callable[[Any], Array] | None = None
-    """``(memory) -> action`` that the agent intended in its latest ``begin`` or ``proceed``, in the shape
-    and dtype of the action that it executed. A demonstrator that executes other actions now and then,
-    such as random ones, defines it: what was executed is the history that a policy reads, and what was
-    intended is what it imitates (default: the agent executes what it intends, and nothing is kept)."""
+    """``(memory) -> action``: the action that the agent intended in its latest ``begin`` or ``proceed``,
+    with the shape and dtype of the executed one. It is for demonstrators that sometimes execute other
+    actions, such as random ones: policies read the executed actions as history, and imitate the intended
+    ones (default: executed actions are the intended ones, and no others are kept)."""
 
 
 class Demonstrator(NamedTuple):
-    """Where a dataset comes from: tasks to demonstrate and the agent that does."""
+    """The source of a dataset: tasks to demonstrate, and the agent that demonstrates them."""
 
     sample_task: Callable
-    """``(key, index) -> task`` of the index-th demonstration."""
+    """``(key, index) -> task``: the task of the index-th demonstration."""
     agent: Callable[[Any], Agent]
     """``(weights) -> agent``."""
     keeps: Callable = lambda episode: episode.trajectory.length > 0
-    """``(episode) -> bool``; other demonstrations are dropped and tried again."""
+    """``(episode) -> bool``: whether to keep a demonstration; others are discarded and repeated."""
     hindsight_return: Callable | None = None
-    """``(trajectory) -> return`` on the task that the trajectory happens to solve (default: the return
-    of the episode)."""
+    """``(trajectory) -> return`` on the task that the trajectory accomplishes in hindsight (default: the
+    return of the episode)."""
     weights: Any = ()
-    """Arrays that the agent is made from, such as the weights of a network; they enter programs as data."""
+    """Arrays that the agent is made from, such as the parameters of a network; they are traced."""
     settings: tuple[tuple[str, float], ...] = ()
-    """Names and values of what else its data depends on; a dataset made with others is out of date."""
+    """Names and values of the settings that the data depend on; a dataset made with others is out of
+    date."""
     configured: Callable[[Mapping[str, float]], Demonstrator] | None = None
     """``(values) -> demonstrator`` with some of its settings changed; raises ``ValueError`` for a value out
-    of range. None where they are fixed."""
+    of range. None if the settings are fixed."""
     env: Environment | None = None
-    """The world that it demonstrates in, where that is another one than the world it is asked for. Both
-    have the same observations, goals and actions, and equal tasks have equal fingerprints."""
+    """The world in which it demonstrates, if that differs from the world that the data are for. Both have
+    the same observations, goals and actions, and equal tasks have equal fingerprints."""
     variants: tuple[str, ...] = ()
-    """Names of the variants of that world, such as its scenes, of which each task is of one."""
+    """Names of the variants of the world, such as its scenes. Every task belongs to one variant."""
     variant: Callable = lambda task: jnp.zeros((), jnp.int32)
-    """``(task) -> index`` into ``variants``; a dataset keeps it for every trajectory."""
+    """``(task) -> index`` into ``variants``, which a dataset stores for every trajectory."""

@@ -1,8 +1,8 @@
-"""Whether a world keeps what every world promises: ``envs.check_world(world)``.
+"""Checks that a world fulfills the contract of every world: ``envs.check_world(world)``.
 
-The rules are those of ``envs/base.py``. A few episodes are played, half of them by the world's first
-demonstrator where it has one and the others at random, to beyond their horizon. Each broken promise becomes
-one sentence with the step that shows it. Rules that build on a broken one are left out.
+The rules are those of ``envs/base.py``. A few episodes are run beyond their horizon, half of them with the
+world's first demonstrator, if it has one, and the others with random actions. Each violation becomes a
+sentence that names the step which shows it. Rules that depend on a violated one are skipped.
 """
 
 from __future__ import annotations
@@ -27,28 +27,30 @@ from envs.errors import NotAvailableError, UsageError, shown
 from envs.registry import World
 
 LANES = 6
-"""Episodes that are played."""
+"""Number of episodes that are run."""
 AFTER_END = 4
-"""Steps beyond the horizon."""
+"""Number of steps beyond the horizon."""
 EAGER_STEPS = 3
-"""Steps without ``jit``, which take long in some worlds."""
+"""Number of steps without ``jit``, which take long in some worlds."""
 CLOSE = 1e-5
-"""How far numbers of one computation may be apart when it is compiled in different ways."""
+"""Tolerance between results of the same computation compiled in different ways."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """What a check found."""
+    """The result of a check."""
 
     name: str
-    """Of the world."""
+    """The name of the world."""
     faults: tuple[str, ...]
-    """Broken promises, a sentence each."""
+    """The violations of the contract, a sentence each."""
     notes: tuple[str, ...] = ()
-    """What is allowed but may surprise, and what could not be checked, a sentence each."""
+    """Remarks on what is allowed but may be unintended, and on what could not be checked, a sentence
+    each."""
     facts: Mapping[str, float] = field(default_factory=dict)
-    """``steps_per_cpu_second`` in live episodes, ``compile_seconds`` (of processor time) of a program with
-    a reset and a step, ``episodes``, ``steps`` and ``tasks`` that were looked at."""
+    """Measurements: ``steps_per_cpu_second`` in running episodes, ``compile_seconds`` (CPU time) of a
+    program with a reset and a step, and the numbers of ``episodes``, ``steps`` and ``tasks`` that were
+    checked."""
 
     def __str__(self) -> str:
         lines = [f"{self.name}: {_count(len(self.faults), 'fault')}"]
@@ -64,35 +66,35 @@ class Report:
 
 
 class _Played(NamedTuple):
-    """Episodes, numpy leaves ``[L, ..]`` or ``[L, T, ..]``."""
+    """The output of L episodes, as numpy leaves ``[L, ..]`` or ``[L, T, ..]``."""
 
     first: Any
-    """A ``TimeStep``."""
+    """The ``TimeStep`` of the reset."""
     steps: Any
-    """``TimeStep``s of every step."""
+    """The ``TimeStep`` of every step."""
     unchanged: Any
-    """Whether a step left the whole state as it was."""
+    """Whether a step left the whole state unchanged."""
 
 
 @dataclass(frozen=True)
 class _Case:
-    """What the rules for episodes look at."""
+    """The episodes that the rules are checked on."""
 
     env: Environment
     tasks: Task
-    """Of the episodes, leaves ``[L, ..]``."""
+    """The tasks of the episodes, leaves ``[L, ..]``."""
     keys: Any
     actions: Any
     shown: int
-    """How many of the episodes, the first ones, are those of a demonstrator."""
+    """The number of episodes that are demonstrations; they come first."""
     play: Any
-    """``(keys, tasks, actions) -> played``, compiled."""
+    """``(keys, tasks, actions) -> _Played``, compiled."""
     played: _Played
     ends: np.ndarray
-    """The step with which each episode ended, counted from 0; -1 for one that did not end."""
+    """The last step of each episode, counted from 0; -1 for an episode that did not end."""
 
     def place(self, lane: int, step: int) -> str:
-        """Where something was seen, in words; steps count from 1 as in a diary."""
+        """An episode and a step (counted from 1) as text for a message."""
         who = "the demonstrator's actions" if lane < self.shown else "random actions"
         return f"step {step + 1} of episode {lane} ({who})"
 
@@ -102,13 +104,13 @@ def check_world(world: World | Environment | str, seed: int = 0) -> Report:
 
     Args:
       world: its record, its name or place (``my_package.my_world:WORLD``), or its environment.
-      seed: of tasks, episodes and random actions.
+      seed: random seed of tasks, episodes and random actions.
 
     Returns:
-      The report; ``print`` shows it.
+      The report, which ``print`` shows as text.
 
     Raises:
-      UsageError: if there is no such world, or what it needs is not installed.
+      UsageError: if there is no such world, or packages that it needs are not installed.
     """
     record: Any = envs.registry.find(world) if isinstance(world, str) else world
     notes: list[str] = []
@@ -136,7 +138,7 @@ def check_world(world: World | Environment | str, seed: int = 0) -> Report:
     facts["tasks"] = float(len(jax.tree.leaves(tasks)[0]))
     impure = [*_repetition_faults(case, repeated)]
     faults += impure
-    if not impure:  # nothing else that is seen could be relied on
+    if not impure:  # otherwise no other observation would be reliable
         for rule in (_end_faults, _absorbing_faults, _reward_faults, _goal_faults, _program_faults):
             faults += rule(case)
         faults += _chance_faults(case, notes)
@@ -154,7 +156,7 @@ def _reason(error: BaseException) -> str:
 
 
 def _record_faults(env: Any) -> Iterator[str]:
-    """What is wrong before anything runs."""
+    """Faults of the type and the spec of an environment, before anything runs."""
     if not isinstance(env, Environment):
         yield f"make() returns a {type(env).__name__}; derive the world from envs.Environment"
         return
@@ -180,14 +182,14 @@ def _record_faults(env: Any) -> Iterator[str]:
 
 
 def _trace_faults(env: Environment) -> Iterator[str]:
-    """What cannot become a program, and what leaves something behind when it does."""
+    """Functions that cannot be traced, that leak tracers, or that give different programs each time."""
     key = jax.random.key(0)
     kept: dict[str, Any] = {}
 
     def shape_of(name: str, function: Any, *args: Any) -> Iterator[str]:
         try:
             with jax.checking_leaks():
-                # A new function each time, since jax keeps the traces of those it knows.
+                # A new function object each time, since jax caches traces by function.
                 traces = [
                     jax.make_jaxpr(partial(function), return_shape=True)(*args) for _ in range(2)
                 ]
@@ -222,15 +224,15 @@ def _trace_faults(env: Environment) -> Iterator[str]:
 
 
 def _same_programs(a: Any, b: Any) -> bool:
-    """Whether two traces are one program with the same constants."""
-    texts = [re.sub(r"0x[0-9a-f]+", "", str(one)) for one in (a, b)]  # without addresses
+    """Whether two traces are the same program with the same constants."""
+    texts = [re.sub(r"0x[0-9a-f]+", "", str(one)) for one in (a, b)]  # without memory addresses
     if texts[0] != texts[1] or len(a.consts) != len(b.consts):
         return False
     return all(np.array_equal(x, y) for x, y in zip(a.consts, b.consts, strict=True))
 
 
 def _shape_faults(env: Environment) -> Iterator[str]:
-    """Shapes and dtypes of all that a world returns."""
+    """Wrong shapes and dtypes in the outputs of a world."""
     spec, key = env.spec, jax.random.key(0)
     task = jax.eval_shape(env.sample_task, key)
     wanted = {
@@ -269,7 +271,7 @@ def _shape_faults(env: Environment) -> Iterator[str]:
 
 
 def _misfit(what: str, found: Any, shape: tuple[int, ...], dtype: str) -> Iterator[str]:
-    """A sentence on an array of another shape or dtype than it should have."""
+    """A sentence about an array whose shape or dtype is wrong."""
     found = jax.eval_shape(lambda: jnp.asarray(found)) if isinstance(found, bool) else found
     if not hasattr(found, "dtype"):
         yield f"{what} is a {type(found).__name__}; it must be an array {dtype}{list(shape)}"
@@ -284,7 +286,7 @@ def _draw(env: Environment, seed: int, num: int) -> tuple[Task, Task]:
 
 
 def _task_faults(env: Environment, tasks: Task, again: Task, num_test_tasks: int) -> Iterator[str]:
-    """Whether tasks are valid, differ, and follow from their key."""
+    """Tasks that are invalid, not diverse enough, or not determined by their key."""
     num = len(jax.tree.leaves(tasks)[0])
     if not _equal(tasks, again):
         yield "sample_task is not pure: the same key drew two different tasks"
@@ -309,7 +311,7 @@ def _task_faults(env: Environment, tasks: Task, again: Task, num_test_tasks: int
 def _first_demonstrator(
     record: World | None, env: Environment, notes: list[str]
 ) -> Demonstrator | None:
-    """The demonstrator whose episodes are looked at."""
+    """The demonstrator whose episodes are checked; None if there is none."""
     known = record.demonstrators(env) if record else {}
     for name, demonstrator in known.items():
         if demonstrator.env in (None, env):
@@ -323,7 +325,7 @@ def _first_demonstrator(
 def _episodes(
     env: Environment, demonstrator: Demonstrator | None, tasks: Task, seed: int
 ) -> tuple[_Case, _Played, dict[str, float]]:
-    """Play: the case, the same episodes once more, and what it took."""
+    """Run the episodes twice; returns the case, the repeated episodes, and measurements."""
     horizon = env.spec.horizon
     keys = jax.random.split(jax.random.key(seed + 1), LANES)
     tasks = jax.tree.map(lambda leaf: leaf[:LANES], tasks)
@@ -332,7 +334,7 @@ def _episodes(
     if demonstrator is not None:
         num_shown = LANES // 2
         tasks, actions = _demonstrated(env, demonstrator, keys[:num_shown], tasks, actions)
-    # The episode loop of the project splits its key; here the world gets the same key as there.
+    # The episode loop of the project splits its key; here the world is given the same key as there.
     keys = jax.vmap(lambda key: jax.random.split(key, 3)[0])(keys)
     compiled = jax.jit(
         jax.vmap(partial(_play, env)), compiler_options=dict(env.engine.compiler_options)
@@ -366,7 +368,7 @@ def _random_actions(spec: EnvSpec, num: int, key: PRNGKeyArray) -> Array:
 def _demonstrated(
     env: Environment, demonstrator: Demonstrator, keys: Any, tasks: Task, actions: Array
 ) -> tuple[Task, Array]:
-    """The tasks and actions with those of demonstrations in the first places."""
+    """Replace the first tasks and actions by those of demonstrations."""
 
     def demonstrate(key: PRNGKeyArray, index: Array, weights: Any) -> tuple[Task, Array, Array]:
         task = demonstrator.sample_task(key, index)
@@ -387,7 +389,7 @@ def _demonstrated(
 
 
 def _play(env: Environment, key: PRNGKeyArray, task: Task, actions: Array) -> _Played:
-    """One episode with these actions, to beyond its end."""
+    """Run one episode with given actions, beyond its end."""
     state, first = env.reset(key, task)
 
     def step(state: Any, action: Array) -> Any:
@@ -395,13 +397,13 @@ def _play(env: Environment, key: PRNGKeyArray, task: Task, actions: Array) -> _P
         return after, (timestep, _all_equal(state, after))
 
     _, (steps, unchanged) = jax.lax.scan(step, state, actions)
-    # A world may say ``failed=False`` as a constant.
+    # ``failed`` may be the constant False.
     filled = jnp.broadcast_to(jnp.asarray(steps.failed), steps.reward.shape)
     return _Played(first, steps._replace(failed=filled), unchanged)
 
 
 def _raw(leaf: Any) -> Any:
-    """Random keys as their numbers."""
+    """The raw data of random keys; any other array unchanged."""
     is_key = jnp.issubdtype(jnp.result_type(leaf), jax.dtypes.prng_key)
     return jax.random.key_data(leaf) if is_key else leaf
 
@@ -422,12 +424,12 @@ def _equal(a: Any, b: Any) -> bool:
 
 
 def _first(mask: np.ndarray) -> tuple[int, ...]:
-    """The first place where a mask is true."""
+    """The index of the first true entry of a mask."""
     return tuple(int(i) for i in np.argwhere(mask)[0])
 
 
 def _end_faults(case: _Case) -> Iterator[str]:
-    """Whether episodes begin alive and end once, at the horizon at the latest."""
+    """Episodes that are over at their start, end in two ways at once, or do not end at the horizon."""
     first, steps, horizon = case.played.first, case.played.steps, case.env.spec.horizon
     begun = np.asarray(first.terminated | first.truncated)
     if begun.any():
@@ -450,7 +452,7 @@ def _end_faults(case: _Case) -> Iterator[str]:
 
 
 def _absorbing_faults(case: _Case) -> Iterator[str]:
-    """Whether nothing changes and nothing is earned after the end."""
+    """Changes or rewards after the end of an episode."""
     steps = case.played.steps
     for lane, end in enumerate(case.ends.tolist()):
         if end < 0:
@@ -470,7 +472,7 @@ def _absorbing_faults(case: _Case) -> Iterator[str]:
                 f"{case.place(lane, step)} changes the state after the end of the episode at step "
                 f"{end + 1}; terminal states must stay as they are"
             )
-        # A goal is reached in one step: a state that stays need not say ``goal_reached`` again and again.
+        # ``goal_reached`` refers to a single step, so it need not stay the same after the end.
         for name in ("obs", "achieved_goal", "outcome", "terminated", "truncated"):
             rows = getattr(steps, name)[lane, end:]
             differs = np.array([not np.array_equal(row, rows[0]) for row in rows])
@@ -483,7 +485,7 @@ def _absorbing_faults(case: _Case) -> Iterator[str]:
 
 
 def _reward_faults(case: _Case) -> Iterator[str]:
-    """Whether rewards are finite and returns within the stated range."""
+    """Rewards that are not finite, and returns outside of the stated range."""
     rewards, (low, high) = case.played.steps.reward, case.env.spec.return_range
     if not np.isfinite(rewards).all():
         place = _first(~np.isfinite(rewards))
@@ -502,7 +504,7 @@ def _reward_faults(case: _Case) -> Iterator[str]:
 
 
 def _goal_faults(case: _Case) -> Iterator[str]:
-    """Whether observations and goals are numbers, and mean what they should."""
+    """Observations and goals that are not finite or contradict their meaning."""
     steps, lanes = case.played.steps, range(len(case.ends))
     for name in ("obs", "achieved_goal", "outcome"):
         bad = ~np.isfinite(getattr(steps, name)).reshape(*steps.reward.shape, -1).all(axis=2)
@@ -533,11 +535,11 @@ def _goal_faults(case: _Case) -> Iterator[str]:
 
 
 def _outcome_faults(case: _Case) -> Iterator[str]:
-    """Whether the outcome of an episode that solves its task is the goal of that task."""
+    """Episodes that solve their task, but whose outcome is not the goal of that task."""
     steps = case.played.steps
     wanted = np.asarray(jax.vmap(case.env.task_goal)(case.tasks))
-    # A goal of amounts is met within some distance, which only the world knows: it is far below that of
-    # two goals of different tasks.
+    # Continuous goals are met within a tolerance that only the world knows. It is far below the distance
+    # between the goals of two different tasks.
     apart = np.linalg.norm(wanted[:, None] - wanted[None], axis=-1)
     apart = apart[apart > 0]
     near = 0.5 * np.median(apart) if apart.size else 1e-3
@@ -564,7 +566,7 @@ def _outcome_faults(case: _Case) -> Iterator[str]:
 
 
 def _difference(a: _Played, b: _Played, tolerance: float = 0.0) -> tuple[int, int, str] | None:
-    """Episode, step (0 for the reset) and field of the first difference between two plays."""
+    """The episode, step (0 for the reset) and field of the first difference between two runs."""
     found: list[tuple[int, int, str]] = []
     for name in TimeStep._fields:
         for mine, other, offset in ((a.first, b.first, 0), (a.steps, b.steps, 1)):
@@ -587,13 +589,13 @@ def _at(case: _Case, where: tuple[int, int, str]) -> str:
 
 
 def _repetition_faults(case: _Case, repeated: _Played) -> Iterator[str]:
-    """Whether the same inputs have the same outputs."""
+    """Differences between two runs with the same inputs."""
     if where := _difference(case.played, repeated):
         yield f"the world is not pure: the same keys, tasks and actions played twice, {_at(case, where)}"
 
 
 def _chance_faults(case: _Case, notes: list[str]) -> Iterator[str]:
-    """Whether chance has a part in episodes exactly where the spec says so."""
+    """Contradictions between ``EnvSpec.deterministic`` and episodes with different keys."""
     others = jax.vmap(lambda key: jax.random.fold_in(key, 1))(case.keys)
     where = _difference(case.played, _numpy(case.play(others, case.tasks, case.actions)))
     if where and case.env.spec.deterministic:
@@ -608,7 +610,7 @@ def _chance_faults(case: _Case, notes: list[str]) -> Iterator[str]:
 
 
 def _program_faults(case: _Case) -> Iterator[str]:
-    """Whether an episode alone, and one without ``jit``, equals the same one in the batch."""
+    """Episodes that differ from those of the batch if they are run alone or without ``jit``."""
     lane = 0
     task = jax.tree.map(lambda leaf: leaf[lane], case.tasks)
     alone = jax.jit(

@@ -1,10 +1,10 @@
-"""A fault of XLA's CPU compiler that would silently give wrong numbers, and the option that avoids it.
+"""A workaround for a bug of XLA's CPU compiler that silently gives wrong numbers.
 
-jaxlib 0.10.2 hands reductions to a library of kernels (YNNPACK). A sum over the products of an array and
-one that is broadcast along its leading axes, which goes on into other arithmetic in the same kernel, is
+jaxlib 0.10.2 delegates reductions to a library of kernels (YNNPACK). If an array is multiplied by one that
+is broadcast along its leading axes, summed, and used in further arithmetic in the same kernel, the sum is
 wrong beyond the first 128 KB of results (https://github.com/jax-ml/jax/issues/39103). It is right in
-0.10.1, by that report, and in 0.11.2. The noise that Crafter's maps are made of is such a sum: the first
-eight worlds of a batch were right, and all others were not those of their seeds.
+0.10.1, according to that report, and in 0.11.2. The noise from which Crafter's maps are generated is such a
+sum: the first eight worlds of a batch were right, and all others were not those of their seeds.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from collections.abc import MutableMapping
 from importlib.metadata import PackageNotFoundError, version
 
 FAULTY = ("0.10.2",)
-"""Versions of jaxlib that have the fault."""
+"""Versions of jaxlib that have the bug."""
 OPTION = "xla_cpu_experimental_ynn_fusion_type"
 
 
 def avoid_fault(environment: MutableMapping[str, str] = os.environ) -> None:
-    """Have XLA compile reductions by itself where the installed jaxlib has the fault.
+    """Let XLA compile reductions without that library if the installed jaxlib has the bug.
 
-    jax may have been imported already, but it reads the variable when it starts its devices; after that
-    nothing helps, and a ``RuntimeWarning`` says so. Where ``XLA_FLAGS`` says something about the option, it
-    stays as it is.
+    This may be called after jax was imported, but not after jax has initialized its devices, which is when
+    it reads the variable; a ``RuntimeWarning`` says so. If ``XLA_FLAGS`` already sets the option, it is
+    left unchanged.
 
     Args:
-      environment: the variables of the process, of which ``XLA_FLAGS`` is changed.
+      environment: the environment variables of the process, of which ``XLA_FLAGS`` is changed.
     """
     flags = environment.get("XLA_FLAGS", "")
     if OPTION in flags or _installed() not in FAULTY:
@@ -45,7 +45,7 @@ def avoid_fault(environment: MutableMapping[str, str] = os.environ) -> None:
 
 
 def _installed() -> str | None:
-    """The version of jaxlib. Other versions may refuse the option, so that it is not given to them."""
+    """The version of jaxlib. Other versions may reject the option, so it is set only if needed."""
     try:
         return version("jaxlib")
     except PackageNotFoundError:
@@ -53,7 +53,7 @@ def _installed() -> str | None:
 
 
 def _has_computed() -> bool:
-    """Whether jax has started its devices in this process."""
-    bridge = sys.modules.get("jax._src.xla_bridge")  # jax has no public function that tells
+    """Whether jax has initialized its devices in this process."""
+    bridge = sys.modules.get("jax._src.xla_bridge")  # jax has no public function for this
     started = getattr(bridge, "backends_are_initialized", None)
     return started is not None and started()

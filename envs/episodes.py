@@ -1,8 +1,9 @@
-"""The only episode loop: policies, baselines and demonstrators all act through it.
+"""The one episode loop, through which policies, baselines and demonstrators all act.
 
-Under ``jax.vmap`` all episodes share one clock, and the loop ends with the last live one. A ``while_loop``
-whose condition differs between lanes would have to select, at every step, between the old and the new of
-everything it carries, whole key-value caches included; here the condition is one scalar for all lanes.
+Under ``jax.vmap`` all episodes step together, and the loop ends with the longest one. If the condition of a
+``while_loop`` differs between lanes, jax selects at every step between the old and the new value of
+everything that the loop carries, including whole key-value caches. Here the condition is a single scalar
+for all lanes, which avoids that.
 """
 
 from __future__ import annotations
@@ -24,25 +25,25 @@ from envs.base import (
     keeps_its_size,
 )
 
-# The loop runs in segments, between which the agent's memory grows. More segments make a step cost what
-# has been seen rather than the horizon, and take longer to compile.
+# The loop runs in segments, between which the agent's memory grows. With more segments the cost of a step
+# follows the number of steps so far rather than the horizon, but compilation takes longer.
 MAX_SEGMENTS = 8
-SEGMENT_STEPS = 32  # an episode is not cut into shorter segments than this
+SEGMENT_STEPS = 32  # length of the shortest segment, in steps
 
 
 def num_segments(horizon: int) -> int:
-    """How many segments an episode of at most ``horizon`` steps runs in."""
+    """The number of segments of an episode with at most ``horizon`` steps."""
     return max(1, min(MAX_SEGMENTS, horizon // SEGMENT_STEPS))
 
 
 def segment_length(horizon: int) -> int:
-    """How many steps a segment has, except that the last one may be shorter."""
+    """The number of steps in a segment; the last one may be shorter."""
     return -(-horizon // num_segments(horizon))
 
 
 @jax.custom_batching.custom_vmap
 def anyone(alive: Bool[Array, ""]) -> Bool[Array, ""]:
-    """Whether this episode, or under ``vmap`` any of the batch, is still running."""
+    """Whether this episode (under ``vmap``, any episode of the batch) is still running."""
     return alive
 
 
@@ -53,7 +54,7 @@ def _anyone_of_batch(size: int, batched: Any, alive: Bool[Array, "B"]) -> tuple[
 
 
 class _Loop(NamedTuple):
-    """State of an episode in progress; ``trajectory`` and ``rewards`` hold its steps so far."""
+    """The state of an episode in progress; ``trajectory`` and ``rewards`` hold its steps so far."""
 
     time: Int[Array, ""]
     anyone_alive: Bool[Array, ""]
@@ -69,12 +70,12 @@ class _Loop(NamedTuple):
 
 
 def run_episode(key: PRNGKeyArray, env: Environment, agent: Agent, task: Task) -> Episode:
-    """One episode of ``agent`` on ``task``, of at most ``env.spec.horizon`` steps.
+    """Run one episode of ``agent`` on ``task``, of at most ``env.spec.horizon`` steps.
 
     Args:
       key: random key.
       env: the world (static).
-      agent: who acts.
+      agent: the agent that acts.
       task: one task of the world.
     """
     horizon = env.spec.horizon
@@ -102,7 +103,7 @@ def run_episode(key: PRNGKeyArray, env: Environment, agent: Agent, task: Task) -
         action, quits, memory = agent.proceed(step_key, loop.memory, loop.state, loop.timestep)
         return _act(env, agent, loop._replace(alive=loop.alive & ~quits, memory=memory), action)
 
-    # A memory of one size needs one segment, which compiles in a fraction of the time.
+    # With a memory of fixed size one segment suffices, which compiles in a fraction of the time.
     segment = horizon if agent.grow is keeps_its_size else segment_length(horizon)
     for start in range(1, horizon, segment):
         end = min(start + segment, horizon)
@@ -124,9 +125,9 @@ def run_episode(key: PRNGKeyArray, env: Environment, agent: Agent, task: Task) -
 def replay(
     key: PRNGKeyArray, env: Environment, task: Task, actions: Array, length: Array
 ) -> Episode:
-    """The episode that had this ``key`` and these ``actions [T, ..]``, of which ``length`` are real.
+    """Replay an episode from its random key and its actions ``[T, ..]``, of which ``length`` are real.
 
-    The actions may be in the small integers in which logs keep them.
+    The actions may be in the compact encoding of logs (``mgpo_jax.adaptation.small_actions``).
     """
     actions = actions.astype(env.spec.zero_action().dtype)
 
@@ -142,12 +143,12 @@ def replay(
 
 
 def _intended(agent: Agent, memory: Any) -> Array | None:
-    """What an agent intended in its latest action; None for an agent that does not tell it."""
+    """The latest action that an agent intended; None for an agent without ``Agent.intended``."""
     return None if agent.intended is None else agent.intended(memory)
 
 
 def _blank(horizon: int, action: Array, timestep: TimeStep, intended: Array | None) -> Trajectory:
-    """A trajectory of no steps with room for ``horizon``."""
+    """A trajectory without steps, with room for ``horizon`` of them."""
 
     def rows(row: Array) -> Array:
         return jnp.zeros((horizon, *row.shape), row.dtype)
@@ -164,7 +165,7 @@ def _blank(horizon: int, action: Array, timestep: TimeStep, intended: Array | No
 
 
 def _act(env: Environment, agent: Agent, loop: _Loop, action: Array) -> _Loop:
-    """Take one action and record what came of it, unless the episode has ended."""
+    """Take one action and record the result, unless the episode has ended."""
     alive = loop.alive
 
     def put(rows: Any, row: Array) -> Array:
@@ -173,11 +174,11 @@ def _act(env: Environment, agent: Agent, loop: _Loop, action: Array) -> _Loop:
 
     state, timestep = env.step(loop.state, action)
     record, intended = loop.trajectory, _intended(agent, loop.memory)
-    goes_on = alive & ~timestep.terminated & ~timestep.truncated
+    still_alive = alive & ~timestep.terminated & ~timestep.truncated
     return _Loop(
         time=loop.time + 1,
-        anyone_alive=anyone(goes_on),
-        alive=goes_on,
+        anyone_alive=anyone(still_alive),
+        alive=still_alive,
         state=state,
         timestep=timestep,
         memory=loop.memory,
@@ -191,7 +192,7 @@ def _act(env: Environment, agent: Agent, loop: _Loop, action: Array) -> _Loop:
             intended=None if intended is None else put(record.intended, intended),
         ),
         rewards=put(loop.rewards, timestep.reward),
-        # Summed step by step: equal rewards make equal returns, whenever they came.
+        # Summed step by step, so that equal rewards give equal returns whenever they come.
         return_=loop.return_ + jnp.where(alive, timestep.reward, 0.0),
         last_obs=jnp.where(alive, timestep.obs, loop.last_obs),
         failed=jnp.where(alive, timestep.failed, loop.failed),

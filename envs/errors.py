@@ -1,4 +1,4 @@
-"""Errors that a person reads: one line that says what is wrong, what was found and what mends it."""
+"""Errors for users: one line that says what is wrong, what was found, and how to mend it."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ _SHORT.maxlevel = 2
 
 
 class UsageError(ValueError):
-    """The request cannot be met as written (command lines exit with 2)."""
+    """The request is invalid as written (commands exit with status 2)."""
 
 
 class DataError(Exception):
-    """Data is missing, damaged, does not fit or cannot be made (command lines exit with 1)."""
+    """Data are missing, damaged, do not fit, or cannot be made (commands exit with status 1)."""
 
 
 class NotAvailableError(UsageError):
-    """A world does not offer something that is optional, such as goals drawn at random."""
+    """A world does not offer an optional feature, such as random goals."""
 
 
 class MissingExtraError(ImportError):
-    """Packages that a world needs are missing, too old, incomplete or do not fit together."""
+    """Packages that a world needs are missing, too old, incomplete, or incompatible with each other."""
 
 
 def nearest(name: str, known: Iterable[str], what: str) -> UsageError:
@@ -37,17 +37,17 @@ def nearest(name: str, known: Iterable[str], what: str) -> UsageError:
 
 
 def shown(value: Any) -> str:
-    """A value as a message shows it: its ``repr``, short and on one line whatever the value holds."""
+    """A value for a message: its ``repr``, shortened and on one line whatever the value holds."""
     try:
         return printable(_SHORT.repr(value))
-    except ValueError:  # Python prints no integer of more than 4,300 digits
+    except ValueError:  # Python does not print integers of more than 4,300 digits
         return "a number that is too long to show"
 
 
 def printable(text: str) -> str:
-    """The text with line breaks and other control characters as escapes.
+    """The text with line breaks and other control characters escaped.
 
-    What comes from a file goes through here before it reaches a terminal, a table or a picture.
+    Any text from a file passes through here before it is shown in a terminal, a table or a picture.
     """
     return "".join(
         char if char.isprintable() else char.encode("unicode_escape").decode() for char in text

@@ -1,7 +1,7 @@
-"""A world from any gymnasium environment: what has to be said of it, and what is read off it.
+"""A world from any gymnasium environment: its description, and what is derived from the environment itself.
 
-``GymnasiumWorld(name=.., make=.., return_range=..).world()`` is a record that every command takes. This
-module imports neither jax nor gymnasium; one environment is made when the world is first used.
+``GymnasiumWorld(name=.., make=.., return_range=..).world()`` is a record that every command accepts. This
+module imports neither jax nor gymnasium; one environment is created when the world is first used.
 """
 
 from __future__ import annotations
@@ -22,54 +22,58 @@ if TYPE_CHECKING:
     from envs.hosted import Hosted
 
 Script = Callable[[Any, np.random.Generator], Act]
-"""``(env, generator) -> act`` for one episode, after its reset; ``act(moment)`` is the next action, in
-units of the environment, or None to end the episode."""
+"""``(env, generator) -> act``: called after the reset of an episode. ``act(moment)`` then returns the next
+action, in units of the environment, or None to end the episode."""
 
 
 class Shapes(NamedTuple):
-    """What one environment showed of itself."""
+    """Shapes and spaces, derived from one environment."""
 
     obs: ArraySpec
     goal: int
     actions: Discrete | Box
     horizon: int
     options: dict[str, np.ndarray]
-    """An example of a task's options."""
+    """The options of an example task."""
     blank: Reading
-    """Zeros of the right shapes."""
+    """A reading of zeros with the right shapes."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class GymnasiumWorld:
-    """What makes a gymnasium environment a world. All functions run on the host, on numpy arrays.
+    """The description that turns a gymnasium environment into a world.
 
-    Functions of a moment see the observation, the ``info``, the environment itself, and the reward and the
-    flags of the step (``envs.live.Moment``). Where observations are those of a ``GoalEnv``, a dict with
-    ``observation``, ``achieved_goal`` and ``desired_goal``, none of them needs to be given.
+    All functions run on the host, with numpy. Functions of a moment have access to the observation, the
+    ``info``, the environment itself, and the reward and the flags of the step (``envs.live.Moment``). If
+    observations are those of a ``GoalEnv``, dicts with ``observation``, ``achieved_goal`` and
+    ``desired_goal``, none of these functions needs to be given.
 
     Attributes:
-      name: of the world.
-      make: a new environment, such as ``lambda: gymnasium.make("PointMaze_UMaze-v3")``.
+      name: the name of the world.
+      make: creates an environment, such as ``lambda: gymnasium.make("PointMaze_UMaze-v3")``.
       return_range: smallest and largest possible return.
-      horizon: actions after which an episode is truncated [``max_episode_steps`` / ``repeat``].
-      repeat: steps of the environment that an action lasts; their rewards are summed.
-      options: ``(generator) -> dict`` of numbers and arrays that a task passes to ``reset(options=..)``;
-        a task then is such options and a seed [a task is a seed].
-      deterministic: whether an episode is reset with the seed of its task. If not, each episode has a seed
-        of its own, and the options alone are the task.
-      observe: what a policy sees [``observation`` of a dict, or all of it, Discrete ones as one-hots].
-      achieved: the goal reached now, ``[G]`` [``achieved_goal``].
-      desired: the goal of the task, of the moment after its reset, ``[G]`` [``desired_goal``].
-      reached: whether the goal counts as reached now [always].
-      outcome: the task goal that an episode would have in hindsight if it ended now [``achieved``].
-      reward: the reward of a moment [the environment's].
-      scripts: who can demonstrate, by name; the first is the default.
-      goals: goals that can stand in a prompt, for methods that insert random ones [none].
+      horizon: number of actions after which an episode is truncated [``max_episode_steps`` / ``repeat``].
+      repeat: number of environment steps per action; their rewards are summed.
+      options: ``(generator) -> dict`` of numbers and arrays that a task passes to ``reset(options=..)``; a
+        task then consists of options and a seed [a task is only a seed].
+      deterministic: whether an episode is reset with the seed of its task. If not, each episode has its own
+        seed, and a task consists of the options alone.
+      observe: ``(moment) -> observation`` of the policy [``observation`` of a dict, or the whole
+        observation, with Discrete ones as one-hots].
+      achieved: ``(moment) -> goal [G]`` that is achieved now [``achieved_goal``].
+      desired: ``(moment) -> goal [G]`` of the task, given the moment after its reset [``desired_goal``].
+      reached: ``(moment) -> bool``, whether the goal counts as reached now [always].
+      outcome: ``(moment) -> goal [G]``, the task goal that an episode would accomplish in hindsight if it
+        ended now [``achieved``].
+      reward: ``(moment) -> reward`` [the environment's].
+      scripts: the demonstrators, by name; the first is the default.
+      goals: the goals from which random goals for prompts are drawn [none].
       optimum: the best return on every task [unknown].
-      most: how many environments are kept alive. Collecting runs 250 episodes at once; where fewer are
-        kept, episodes are played again from their resets, which is slow.
-      threads: how many threads step them [1: Python code runs on one at a time].
-      together: how many episodes a program steps at least in one call.
+      most: number of environments that are kept alive. Collection runs 250 episodes at once; with fewer
+        environments, episodes are replayed from their resets, which is slow.
+      threads: number of threads that step the environments [1, since Python code runs on one thread at a
+        time].
+      together: smallest number of episodes that a program steps in one call.
       truncate_in_hindsight, reward_confirms_goals, goals_are_states: see ``envs.EnvSpec``.
     """
 
@@ -124,10 +128,10 @@ class GymnasiumWorld:
         )
 
     def environment(self) -> Hosted:
-        """The world."""
+        """The environment of the world."""
         from envs.hosted import Hosted
 
-        _ = self.shapes  # complains before the first use
+        _ = self.shapes  # raises errors early, before the first use
         return Hosted(self)
 
     @cached_property
@@ -151,10 +155,10 @@ class GymnasiumWorld:
 
     @cached_property
     def shapes(self) -> Shapes:
-        """Shapes and spaces, from one environment that is made and reset.
+        """Shapes and spaces, from one environment that is created and reset.
 
         Raises:
-          UsageError: if they are none that a world can have.
+          UsageError: if they are not supported.
         """
         from envs.base import ArraySpec
 
@@ -183,12 +187,12 @@ class GymnasiumWorld:
 
     @cached_property
     def action_space(self) -> Any:
-        """Of the environment."""
+        """The action space of the environment."""
         return self._example.action_space
 
     @cached_property
     def _example(self) -> Any:
-        """An environment to look at, which no episode is played in."""
+        """An environment that is only inspected; no episode runs in it."""
         return self.make()
 
     def _horizon(self, env: Any) -> int:
@@ -222,7 +226,7 @@ class GymnasiumWorld:
     def drawn_options(self, seed: int) -> dict[str, np.ndarray]:
         """The options of the task with this seed, as arrays of 32 bits or booleans."""
         drawn = self.options(np.random.default_rng(seed)) if self.options else {}
-        return {name: _narrow(np.asarray(drawn[name])) for name in sorted(drawn)}
+        return {name: _to_32_bits(np.asarray(drawn[name])) for name in sorted(drawn)}
 
     @cached_property
     def _option_names(self) -> list[str]:
@@ -238,7 +242,7 @@ class GymnasiumWorld:
         return Moment(obs, info, env)
 
     def step(self, env: Any, action: np.ndarray) -> Moment:
-        """One action of a program, as many steps as it lasts."""
+        """Take one action of a program, which lasts ``repeat`` steps of the environment."""
         own, total = self.to_env(action), 0.0
         for _ in range(self.repeat):
             obs, reward, terminated, truncated, info = env.step(own)
@@ -248,7 +252,7 @@ class GymnasiumWorld:
         return Moment(obs, info, env, total, bool(terminated), bool(truncated))
 
     def to_env(self, action: np.ndarray) -> Any:
-        """An action of a program in units of the environment."""
+        """Convert an action of a program to units of the environment."""
         space = self.action_space
         if not action.ndim:
             return int(action) + int(space.start)
@@ -257,7 +261,7 @@ class GymnasiumWorld:
         return scaled.astype(space.dtype).reshape(space.shape)
 
     def to_program(self, action: Any) -> np.ndarray:
-        """An action of the environment as programs have it."""
+        """Convert an action of the environment to the form of programs."""
         space = self.action_space
         if type(space).__name__ == "Discrete":
             return np.asarray(int(action) - int(space.start))
@@ -265,17 +269,17 @@ class GymnasiumWorld:
         return np.clip(2 * (np.ravel(action).astype(float) - low) / (high - low) - 1, -1, 1)
 
     def read(self, moment: Moment) -> Reading:
-        """A moment as arrays; numbers that are not finite mean that the environment broke down."""
+        """A moment as arrays. If a number is not finite, the environment counts as failed."""
         obs, goal = self._observed(moment), self._goal(moment, "achieved")
         outcome, reward = self._outcome(moment, goal), np.asarray(self.reward(moment), np.float32)
         finite = all(np.isfinite(part).all() for part in (obs, goal, outcome, reward))
         flags = (self.reached(moment), moment.terminated, moment.truncated, not finite)
-        told = Reading(obs, goal, outcome, reward, np.asarray(flags, np.uint8))
-        # Copies, since an environment may go on writing into the arrays that it has told.
-        return Reading(*map(np.array if finite else np.nan_to_num, told))
+        reading = Reading(obs, goal, outcome, reward, np.asarray(flags, np.uint8))
+        # Copies, since an environment may later overwrite the arrays that it returned.
+        return Reading(*map(np.array if finite else np.nan_to_num, reading))
 
     def goal_of(self, moment: Moment) -> np.ndarray:
-        """The goal of a task, of the moment after its reset."""
+        """The goal of a task, given the moment after its reset."""
         return self._goal(moment, "desired")
 
     def _goal(self, moment: Moment, which: str) -> np.ndarray:
@@ -295,14 +299,14 @@ class GymnasiumWorld:
 
     def _observed(self, moment: Moment) -> np.ndarray:
         if self.observe is not None:
-            return _narrow(np.asarray(self.observe(moment)))
+            return _to_32_bits(np.asarray(self.observe(moment)))
         obs, space = moment.obs, moment.env.observation_space
         if isinstance(obs, Mapping) and "observation" in obs:
             obs, space = obs["observation"], space["observation"]
-        return _narrow(np.asarray(self._flat(obs, space)))
+        return _to_32_bits(np.asarray(self._flat(obs, space)))
 
     def _flat(self, obs: Any, space: Any) -> Any:
-        """An observation as one array: boxes as they are, discrete ones as one-hots, dicts joined."""
+        """An observation as one array: boxes unchanged, discrete ones as one-hots, dicts concatenated."""
         kind = type(space).__name__
         if kind == "Discrete":
             return np.eye(int(space.n), dtype=np.float32)[int(obs) - int(space.start)]
@@ -317,8 +321,8 @@ class GymnasiumWorld:
         )
 
 
-def _narrow(array: np.ndarray) -> np.ndarray:
-    """An array in a dtype that programs of 32 bits have."""
+def _to_32_bits(array: np.ndarray) -> np.ndarray:
+    """Convert an array to a dtype of at most 32 bits."""
     if array.dtype.kind == "f":
         return np.asarray(array, np.float32)
     if array.dtype.kind in "iu" and array.dtype != np.uint8:

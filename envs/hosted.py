@@ -1,7 +1,8 @@
-"""A gymnasium environment as a world: pure functions whose steps are taken on the host behind a callback.
+"""A gymnasium environment as a world: pure functions that step environments on the host by a callback.
 
 The state of an episode holds how it began, its identity, its actions and the number of its steps, so that
-any step can be taken again at any time: see ``envs/live.py``. ``vmap`` gathers all episodes into one call.
+any step can be repeated at any time (see ``envs/live.py``). Under ``vmap`` all episodes are stepped in one
+call.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ MAX_SEED = 2**31 - 1
 
 
 class HostedTask(NamedTuple):
-    """A task: what its resets get, and the goal that the first observation tells."""
+    """A task: the arguments of its resets, and the goal in the first observation."""
 
     seed: Int[Array, "*batch"]
     goal: Float[Array, "*batch G"]
@@ -38,14 +39,14 @@ class HostedState(NamedTuple):
 
     task: HostedTask
     seed: Int[Array, ""]
-    """Of its reset."""
+    """Random seed of its reset."""
     identity: UInt[Array, "2"]
-    """Hash of all that has happened in it."""
+    """Hash of everything that has happened in it."""
     actions: Array
-    """``[T]`` or ``[T, A]``: those taken so far, then zeros."""
+    """``[T]`` or ``[T, A]``: the actions taken so far, padded with zeros."""
     steps: Int[Array, ""]
     told: TimeStep
-    """What the last step told, with reward 0."""
+    """The time step of the last step, with reward 0."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class Hosted(Environment):
         return task.goal
 
     def fingerprint(self, task: HostedTask) -> Int[Array, "F"]:
-        """Seed and options where the seed is part of the task; elsewhere options and goal."""
+        """Seed and options if the seed is part of the task; otherwise options and goal."""
         if not self.described.deterministic:
             return super().fingerprint((task.options, task.goal))
         return super().fingerprint((task.seed, task.options))
@@ -100,15 +101,15 @@ class Hosted(Environment):
     def reset(self, key: PRNGKeyArray, task: HostedTask) -> tuple[HostedState, TimeStep]:
         drawn = jax.random.randint(key, (), 0, MAX_SEED)
         seed = task.seed if self.described.deterministic else drawn
-        told, identity = self._told(_begin_all, seed, task.options)
+        timestep, identity = self._call_host(_begin_all, seed, task.options)
         zero = self.spec.zero_action()
         actions = jnp.zeros((self.spec.horizon, *zero.shape), zero.dtype)
-        return HostedState(task, seed, identity, actions, jnp.int32(0), told), told
+        return HostedState(task, seed, identity, actions, jnp.int32(0), timestep), timestep
 
     def step(self, state: HostedState, action: Array) -> tuple[HostedState, TimeStep]:
         over = state.told.terminated | state.told.truncated
         action = jnp.asarray(action).astype(state.actions.dtype)
-        told, identity = self._told(
+        timestep, identity = self._call_host(
             _advance_all,
             state.seed,
             state.task.options,
@@ -119,16 +120,16 @@ class Hosted(Environment):
             ~over,
         )
         steps = state.steps + 1
-        at_horizon = (steps >= self.spec.horizon) & ~told.terminated
-        told = told._replace(truncated=told.truncated | at_horizon)
+        at_horizon = (steps >= self.spec.horizon) & ~timestep.terminated
+        timestep = timestep._replace(truncated=timestep.truncated | at_horizon)
         actions = jax.lax.dynamic_update_index_in_dim(state.actions, action, state.steps, 0)
-        quiet = told._replace(reward=jnp.zeros(()))
+        quiet = timestep._replace(reward=jnp.zeros(()))
         after = HostedState(state.task, state.seed, identity, actions, steps, quiet)
         after = jax.tree.map(lambda old, new: jnp.where(over, old, new), state, after)
-        return after, after.told._replace(reward=jnp.where(over, 0.0, told.reward))
+        return after, after.told._replace(reward=jnp.where(over, 0.0, timestep.reward))
 
-    def _told(self, function: Callable, *args: Any) -> tuple[TimeStep, UInt[Array, "2"]]:
-        """What the host tells: a time step, and the identity of the episode."""
+    def _call_host(self, function: Callable, *args: Any) -> tuple[TimeStep, UInt[Array, "2"]]:
+        """Call a function on the host that returns a time step and the identity of the episode."""
         spec = self.spec
         goal = jax.ShapeDtypeStruct((spec.goal_dim,), jnp.float32)
         parts: Any = (
@@ -142,7 +143,7 @@ class Hosted(Environment):
         identity = jax.ShapeDtypeStruct((2,), jnp.uint32)
         reading, identity = on_host(function, self.described, (wanted, identity))(*args)
         reached, terminated, truncated, failed = reading.flags > 0
-        told = TimeStep(
+        timestep = TimeStep(
             obs=reading.obs,
             achieved_goal=reading.achieved_goal,
             goal_reached=reached,
@@ -152,7 +153,7 @@ class Hosted(Environment):
             truncated=truncated & ~terminated & ~failed,
             failed=failed,
         )
-        return told, identity
+        return timestep, identity
 
 
 def _struct(leaf: np.ndarray) -> jax.ShapeDtypeStruct:
@@ -161,7 +162,7 @@ def _struct(leaf: np.ndarray) -> jax.ShapeDtypeStruct:
 
 @cache
 def spec_of(described: GymnasiumWorld) -> EnvSpec:
-    """The spec of a described world; one environment is made and reset for it."""
+    """The spec of a described world, for which one environment is created and reset."""
     shapes: Shapes = described.shapes
     return EnvSpec(
         name=described.name,
@@ -178,10 +179,10 @@ def spec_of(described: GymnasiumWorld) -> EnvSpec:
 
 
 def on_host(function: Callable, described: GymnasiumWorld, wanted: Any) -> Callable:
-    """A function of numpy arrays for B episodes, to be used in programs for one.
+    """Turn a numpy function for B episodes into a jax function for one episode, which ``vmap`` batches.
 
-    ``function(pool, described, *args)`` gets arrays ``[B, ..]`` and returns those of ``wanted`` with that
-    axis.
+    ``function(pool, described, *args)`` takes arrays ``[B, ..]`` and returns arrays of the shapes in
+    ``wanted`` with that leading axis.
     """
     first_rank = len(jax.tree.leaves(wanted)[0].shape)
 
@@ -203,7 +204,7 @@ def on_host(function: Callable, described: GymnasiumWorld, wanted: Any) -> Calla
 
     def compute(*args: Any) -> Any:
         first = np.asarray(jax.tree.leaves(args)[0])
-        batch = first.shape  # the first argument is a number for each episode
+        batch = first.shape  # the first argument is a scalar for each episode
         found = function(described.pool, described, *flat(args, batch))
         leaves = [array.reshape(*batch, *array.shape[1:]) for array in jax.tree.leaves(found)]
         return jax.tree.unflatten(jax.tree.structure(wanted), leaves)
@@ -224,7 +225,7 @@ def _starts(seeds: np.ndarray, options: dict[str, np.ndarray]) -> list[Start]:
 def _draw_tasks(
     pool: Pool, described: GymnasiumWorld, seeds: np.ndarray
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """The goals and options of tasks by their seeds."""
+    """The goals and options of tasks with given seeds."""
 
     def draw(index: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         seed = int(seeds[index])
@@ -267,11 +268,11 @@ def _advance_all(
     action: np.ndarray,
     active: np.ndarray,
 ) -> tuple[Reading, np.ndarray]:
-    """Step those of B episodes that are not over; what is said of the others counts nowhere."""
+    """Step those of B episodes that are active; the results for the others are meaningless."""
     starts = _starts(seeds, options)
     blank = bytes(8), described.shapes.blank
     found: list[tuple[bytes, Reading]] = [blank] * len(starts)
-    places: dict[bytes, list[int]] = {}  # equal episodes with equal actions need one step
+    places: dict[bytes, list[int]] = {}  # equal episodes with equal actions share one step
     for index in np.flatnonzero(active).tolist():
         where = identities[index].tobytes() + action[index].tobytes()
         places.setdefault(where, []).append(index)
@@ -284,14 +285,14 @@ def _advance_all(
             starts[index], identities[index].tobytes(), before, np.asarray(action[index])
         )
 
-    for group, told in zip(groups, pool.map(advance, len(groups)), strict=True):
+    for group, result in zip(groups, pool.map(advance, len(groups)), strict=True):
         for index in group:
-            found[index] = told
+            found[index] = result
     return _rows(found)
 
 
 def script(described: GymnasiumWorld, name: str) -> Demonstrator:
-    """The demonstrator that asks a script of the description for every action."""
+    """The demonstrator that takes every action from a script of the description."""
     env = Hosted(described)
     zero = env.spec.zero_action()
 

@@ -1,10 +1,10 @@
-"""Live environments of gymnasium on the host, found again by what has happened in them. No jax here.
+"""A pool of live gymnasium environments on the host, looked up by the history of their episodes.
 
-A program asks for a step of an episode by the episode's *identity*: a hash of how it began, of the actions
-since and of what came of them. Where a live environment stands exactly there, it is stepped. Where none
-does, since the program plays an episode again or takes another branch of it, a fresh one is reset in the
-same way and the actions are played again. An environment that then arrives elsewhere does not repeat
-itself, and is refused.
+Nothing here imports jax. A program requests a step of an episode by the episode's *identity*: a hash of how
+it began, of the actions since, and of their results. If a live environment is in exactly that place, it is
+stepped. If there is none, because the program repeats an episode or takes another branch of it, a fresh
+environment is reset in the same way and the actions are replayed. If that leads elsewhere, the environment
+is not reproducible, and is rejected.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from envs.errors import DataError
 
 
 class Moment(NamedTuple):
-    """What a gymnasium environment tells after a reset or a step, for the functions that read it."""
+    """The output of a gymnasium environment after a reset or a step, for the functions that read it."""
 
     obs: Any
     info: Mapping[str, Any]
     env: Any
-    """The environment itself, to look at what its observations leave out."""
+    """The environment itself, for what its observations leave out."""
     reward: float = 0.0
-    """Sum over the repeated steps; 0 after a reset."""
+    """Sum of the rewards of the repeated steps; 0 after a reset."""
     terminated: bool = False
     truncated: bool = False
 
 
 class Reading(NamedTuple):
-    """A moment as arrays, in the order and the dtypes in which programs hold them."""
+    """A moment as arrays, with the order and the dtypes that programs use."""
 
     obs: np.ndarray
     achieved_goal: np.ndarray
@@ -52,11 +52,11 @@ class Reading(NamedTuple):
 
 
 class Start(NamedTuple):
-    """How an episode begins: all that its reset depends on."""
+    """The start of an episode: everything that its reset depends on."""
 
     seed: int
     options: tuple[np.ndarray, ...]
-    """The leaves of the options, in their order."""
+    """The leaves of the options, in order."""
 
 
 Act = Callable[[Moment], Any]
@@ -65,7 +65,7 @@ Act = Callable[[Moment], Any]
 
 @dataclass
 class Live:
-    """One environment and where it stands."""
+    """One live environment and its place in an episode."""
 
     env: Any
     identity: bytes = b""
@@ -75,21 +75,21 @@ class Live:
     """Name and seed of the script that follows this episode."""
     act: Act | None = None
     asked: tuple[bytes, Any] | None = None
-    """The identity at which the script was asked last, and its action."""
+    """The identity at which the script was last asked for an action, and that action."""
 
 
 @dataclass(eq=False)
 class Pool:
-    """Live environments that were made by one recipe; callers may be on several threads.
+    """A pool of live environments of one kind. It is thread-safe.
 
     Attributes:
-      make: a new environment.
+      make: creates an environment.
       reset: ``(env, start) -> moment``.
-      step: ``(env, action) -> moment``; the action is that of a program.
+      step: ``(env, action) -> moment``, with an action in the form of programs.
       read: ``(moment) -> reading``.
-      scripts: ``(env, generator) -> act`` by name.
-      most: how many environments are kept alive; the one that was longest not used makes room.
-      num_threads: how many threads step them.
+      scripts: ``(env, generator) -> act``, by name.
+      most: number of environments that are kept alive; the least recently used one is evicted.
+      num_threads: number of threads that step them.
     """
 
     make: Callable[[], Any]
@@ -109,7 +109,7 @@ class Pool:
         self.num_made = self.num_replayed = 0
 
     def begin(self, start: Start) -> tuple[bytes, Moment, Reading]:
-        """A new episode: its identity, its first moment and the reading of that."""
+        """Begin an episode; returns its identity, its first moment and the reading of that moment."""
         live, reading = self._fresh(start)
         found = live.identity, live.moment, reading
         self._put(live)
@@ -118,16 +118,16 @@ class Pool:
     def advance(
         self, start: Start, identity: bytes, actions: np.ndarray, action: np.ndarray
     ) -> tuple[bytes, Reading]:
-        """The identity after one more action, and the reading.
+        """Take one more action in an episode; returns its new identity and the reading.
 
         Args:
           start: how the episode began.
-          identity: where it stands.
-          actions: those taken so far, ``[t, ..]``.
-          action: the next one.
+          identity: its identity so far.
+          actions: the actions taken so far, ``[t, ..]``.
+          action: the next action.
 
         Raises:
-          DataError: if the environment does not repeat itself.
+          DataError: if the environment is not reproducible.
         """
         wanted = identity + action.tobytes()
         live = self._take(identity)
@@ -150,7 +150,7 @@ class Pool:
         return found
 
     def ask(self, start: Start, identity: bytes, actions: np.ndarray, name: str, seed: int) -> Any:
-        """What a script does next in an episode, in units of the environment; None ends the episode."""
+        """The next action of a script in an episode, in units of the environment; None ends the episode."""
         script = (name, seed)
         live = self._take(identity)
         follows = live is not None and (live.script == script or live.steps == 0)
@@ -168,7 +168,7 @@ class Pool:
         return action
 
     def map(self, function: Callable[[int], Any], num: int) -> list[Any]:
-        """``function(0)``, ``function(1)``, .. on the threads of the pool."""
+        """Compute ``function(0)``, .., ``function(num - 1)`` on the threads of the pool."""
         if self._threads is None or num < 2:
             return [function(index) for index in range(num)]
         return list(self._threads.map(function, range(num)))
@@ -202,7 +202,7 @@ class Pool:
         actions: np.ndarray,
         script: tuple[str, int] | None = None,
     ) -> Live:
-        """A live environment that has been brought to where an episode stands."""
+        """A live environment in the place of an episode, reached by replaying the episode's actions."""
         self.num_replayed += 1
         live, _ = self._fresh(start)
         if script is not None:
@@ -226,7 +226,7 @@ class Pool:
 
     def _put(self, live: Live) -> None:
         with self._lock:
-            other = self._live.pop(live.identity, None)  # an equal one
+            other = self._live.pop(live.identity, None)  # one in the same place
             self._live[live.identity] = live
             if other is not None:
                 self._idle.append(other.env)
@@ -236,7 +236,7 @@ class Pool:
             self._idle.append(env)
 
     def _free_env(self) -> Any:
-        """An idle environment, a new one, or that of the episode that was longest not used."""
+        """An idle environment, a new one, or the least recently used one."""
         with self._lock:
             if self._idle:
                 return self._idle.pop()
@@ -247,12 +247,12 @@ class Pool:
 
 
 def num_cores() -> int:
-    """How many cores this process may use."""
+    """The number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _hash(before: bytes, reading: Reading) -> bytes:
-    """8 bytes for what has happened; two episodes agree by chance once in 2^64."""
+    """An 8-byte hash of the history of an episode; two different ones agree with a probability of 2^-64."""
     digest = hashlib.blake2b(before, digest_size=8)
     for part in reading:
         digest.update(part.tobytes())

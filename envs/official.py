@@ -1,8 +1,9 @@
-"""A world beside the program that it re-implements: episodes in both, stepped by hand.
+"""Comparing a world with the official program that it re-implements: episodes in both, stepped from Python.
 
-Where a world has such an official program, written by others, its record says how to reach it
-(``World.official``). Then anyone can act in both and compare what comes of it, without trust in the world
-here. Stepped by hand means step by step from Python, as the official program has to be.
+If a world re-implements an official program by others, its record says how to run that
+(``World.official``). Then the same agent can act in both and the results can be compared, without having to
+trust the re-implementation. Both are stepped one step at a time from Python, since the official program
+requires that.
 """
 
 from __future__ import annotations
@@ -20,34 +21,34 @@ from envs.base import Environment, Task
 
 
 class Played(NamedTuple):
-    """What came of an episode."""
+    """The result of an episode."""
 
     reached: tuple[str, ...]
-    """The goals that were reached, by name and in their order."""
+    """The names of the goals that were reached, in order."""
     steps: tuple[int, ...]
-    """After how many steps each of them was."""
+    """The number of steps after which each goal was reached."""
     return_: float
     length: int
-    """Steps of the episode."""
+    """Number of steps of the episode."""
 
 
 @runtime_checkable
 class ByHand(Protocol):
-    """One episode of one task, stepped by hand."""
+    """One episode of one task, stepped from Python."""
 
     def reset(self) -> np.ndarray:
-        """Begin, and return the first observation."""
+        """Begin the episode; returns the first observation."""
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Take an action, and return the next observation and whether the episode is over."""
+        """Take an action; returns the next observation and whether the episode is over."""
 
     def played(self) -> Played:
-        """What has come of it so far."""
+        """The result so far."""
 
 
 @runtime_checkable
 class Acting(Protocol):
-    """Who acts, such as ``mgpo_jax.Actor``."""
+    """An agent that acts step by step, such as ``mgpo_jax.Actor``."""
 
     def reset(self, obs: np.ndarray) -> np.ndarray:
         """The first action of an episode."""
@@ -58,15 +59,16 @@ class Acting(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Official:
-    """The official program of a world.
+    """The official program that a world re-implements.
 
     Attributes:
-      name: what it is called, with its version.
-      episode: an episode of it on a task of the world, with the return that the task's rule gives.
-      goal_name: a goal ``[G]`` in words, the same ones for both programs.
-      task_name: a task in words.
-      obs_noise: half widths of the uniform noise that it adds by default to each component of an
-        observation, in their units; the episodes here have none. Empty: it adds none.
+      name: its name and version.
+      episode: makes an episode of the program on a task of the world, with the return according to the
+        task's rule.
+      goal_name: the name of a goal ``[G]``, the same for both programs.
+      task_name: a description of a task.
+      obs_noise: half widths of the uniform noise that the program adds by default to each component of an
+        observation, in its units (empty: none). The episodes here have no noise.
     """
 
     name: str
@@ -77,12 +79,12 @@ class Official:
 
 
 class Own:
-    """An episode of a world of this project, stepped by hand.
+    """An episode of a world of this project, stepped from Python.
 
     Args:
       env: the world.
-      task: one task of it.
-      goal_name: a goal in words.
+      task: one of its tasks.
+      goal_name: the name of a goal.
     """
 
     def __init__(
@@ -113,20 +115,20 @@ class Own:
 
 @cache
 def _programs(env: Environment) -> tuple[Any, Any]:
-    """Reset and step of a world as compiled programs."""
+    """The reset and step of a world, jitted."""
     compiled = jax.jit(compiler_options=dict(env.engine.compiler_options))
     return compiled(env.reset), compiled(env.step)
 
 
 def played(reached: list[tuple[str, int]], return_: float, length: int) -> Played:
-    """The record of an episode that reached these goals, each with its step."""
+    """The result of an episode that reached these goals, pairs of name and step."""
     return Played(
         tuple(name for name, _ in reached), tuple(step for _, step in reached), return_, length
     )
 
 
 def play(who: Acting, where: ByHand) -> Played:
-    """One episode from its beginning to its end."""
+    """Run one episode from its beginning to its end."""
     action = who.reset(where.reset())
     while True:
         obs, over = where.step(action)

@@ -1,7 +1,8 @@
-"""What a world brings to HTML pages: plain data, and a JavaScript module with its rules and its drawing.
+"""A world's part of HTML pages: plain data, and a JavaScript module with its rules and its drawing.
 
-Generic code makes the pages, runs the policy in them and lays them out. A world that brings nothing gets
-everything that needs none of it: curves, tables, prompts as numbers, and goals reached on a time line.
+Generic code builds and lays out the pages, and runs the policy in them. For a world without such a part,
+pages show what does not depend on it: curves, tables, prompts as numbers, and a time line of the goals
+reached.
 """
 
 from __future__ import annotations
@@ -21,24 +22,24 @@ Json = Any
 
 @dataclass(frozen=True, kw_only=True)
 class Page:
-    """What a world brings to HTML pages; it leaves out what it does not offer.
+    """A world's part of HTML pages; all of it is optional.
 
     Everything here becomes JSON and is shown as text, never as markup.
 
     Attributes:
-      script: a JavaScript module that exports ``world``, a ``WorldPage`` (``envs/page.d.ts``). It has the
-        rules of the world, with which saved actions are played again and the policy acts in the
-        playground, and draws it. It imports nothing.
-      facts: what the script has to know of this world, such as its size.
-      task: what the script has to know of one task, which has numpy leaves.
-      track: ``(state) -> integers [D]`` from 0 to 255, for a world whose rules cannot be in the script,
-        since chance decides in it: what the drawing has to know of each moment of an episode, such as where
-        the agent is, in terms of ``jax.numpy``. Saved episodes are played again in jax, and the script
-        makes of these numbers what it draws (``moments``). Such a world has no playground.
-      start: ``(obs) -> integers``, what the script has to know of the first observation of an episode,
-        where episodes do not start alike.
-      describe: one task in a few words.
-      parts: names of the components of a goal, where a goal is a set of named parts.
+      script: a JavaScript module that exports ``world``, a ``WorldPage`` (``envs/page.d.ts``). It draws the
+        world, and has its rules, by which saved actions are replayed and the policy acts in the playground.
+        It imports nothing.
+      facts: data about this world for the script, such as its size.
+      task: ``(task) -> data`` about one task for the script; the task has numpy leaves.
+      track: ``(state) -> integers [D]`` from 0 to 255, for a world that cannot be simulated by the script
+        because it is random: the data that the drawing needs about each moment of an episode, such as the
+        position of the agent, computed with ``jax.numpy``. Saved episodes are replayed in jax, and the
+        script turns these numbers into what it draws (``moments``). Such a world has no playground.
+      start: ``(obs) -> integers``, data about the first observation of an episode for the script, if
+        episodes start in different states.
+      describe: ``(task) -> text``, a short description of one task.
+      parts: names of the components of a goal, if a goal is a set of named parts.
     """
 
     script: Path | None = None

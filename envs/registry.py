@@ -1,6 +1,6 @@
-"""The worlds by name, and the record that describes one. Nothing here imports jax.
+"""The registry of worlds, and the record that describes a world. Nothing here imports jax.
 
-A world is found under a name that it was registered with, under the name of an entry point in the group
+A world is found by the name it was registered under, by the name of an entry point in the group
 ``mgpo_jax.worlds``, or as ``module:attribute``.
 """
 
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Judgement:
-    """How the policies of a world are judged: in episodes outside of the budget of a search.
+    """How the policies of a world are judged, in episodes that do not count against the budget of a search.
 
     Attributes:
-      mode: ``greedy`` acts by the likeliest action, ``sample`` by a random one.
-      temperature: of the distribution that ``sample`` draws from; 1 leaves it as it is.
+      mode: ``greedy`` takes the most likely action, ``sample`` a random one.
+      temperature: temperature of the distribution for ``sample``; 1 is the policy's own.
       episodes: number of episodes whose returns are averaged.
     """
 
@@ -43,7 +43,7 @@ class Judgement:
 
     @property
     def tempered(self) -> bool:
-        """Whether actions are drawn from another distribution than the policy's own."""
+        """Whether actions are sampled from a tempered distribution instead of the policy's own."""
         return self.mode == "sample" and self.temperature != 1
 
     def __post_init__(self) -> None:
@@ -56,14 +56,14 @@ class Judgement:
 
 @dataclass(frozen=True, kw_only=True)
 class StepCost:
-    """How episodes are paid where the task is to arrive somewhere in as few steps as possible.
+    """The rewards of a world whose task is to arrive somewhere in as few steps as possible.
 
-    The return of a single episode then says whether it arrived, and after how many steps.
+    They allow to tell from the return of a single episode whether it arrived, and after how many steps.
 
     Attributes:
-      step: what each step costs.
-      arrival: what arriving pays; it ends the episode.
-      horizon: the most steps of an episode.
+      step: the cost of each step.
+      arrival: the reward for arriving, which ends the episode.
+      horizon: the largest number of steps of an episode.
     """
 
     step: float
@@ -71,7 +71,8 @@ class StepCost:
     horizon: int
 
     def num_steps(self, returns: np.ndarray) -> np.ndarray:
-        """Steps of single episodes with these returns until they arrived; infinity where they did not."""
+        """The number of steps until single episodes with these returns arrived; infinity if they did
+        not."""
         import numpy as np
 
         steps = np.rint((self.arrival - np.asarray(returns, np.float64)) / self.step)
@@ -84,28 +85,28 @@ def _no_demonstrators(env: Environment) -> Mapping[str, Demonstrator]:
 
 @dataclass(frozen=True, kw_only=True)
 class World:
-    """Everything that generic code needs to know of a world.
+    """Everything that generic code needs to know about a world.
 
     Attributes:
-      name: what ``--env`` calls it.
+      name: its name, as given to ``--env``.
       make: builds the environment.
-      summary: what it is, in one line.
-      demonstrators: the agents that can collect a dataset, by name; the first is the default. A world
-        without any needs a dataset from elsewhere.
-      presets: what the world's training settings change in the general ones, by preset (``fast``,
-        ``paper``, ``smoke``): names and values of settings of ``experiments.pretrain``. ``ablation`` has
-        the steps and trajectories of the trainings of ``experiments.reproduce``.
-      pictures: what the world draws; None draws learning curves only.
-      page: what the world brings to HTML pages; None shows what needs nothing of it.
+      summary: a one-line description.
+      demonstrators: the demonstrators that can collect a dataset, by name; the first is the default. A
+        world without any needs a dataset from elsewhere.
+      presets: the training settings of this world that differ from the general ones, by preset (``fast``,
+        ``paper``, ``smoke``): names and values of settings of ``experiments.pretrain``. The preset
+        ``ablation`` has the numbers of steps and trajectories for ``experiments.reproduce``.
+      pictures: the pictures that the world can draw; with None only learning curves are drawn.
+      page: the world's part of HTML pages; with None pages have only their generic parts.
       policy_of: the world whose released policy and test tasks this one uses [its own].
-      judged: how policies are judged here; every table follows it.
-      method_defaults: what the world changes in the default hyper-parameters of methods, by the name of the
-        method, such as the unit of returns in which a bandit counts.
-      step_cost: how episodes are paid where the task is to arrive in as few steps as possible; tables then
-        have a success rate and SPL [None: it is another task].
+      judged: how policies are judged in this world, in all tables.
+      method_defaults: default hyper-parameters that differ in this world, by the name of the method, such
+        as the unit of returns of a bandit.
+      step_cost: the rewards of a world whose task is to arrive in as few steps as possible; its tables then
+        have a success rate and SPL [None: another kind of task].
       extra: the extra of this package that it needs [none].
-      num_test_tasks: how many tasks are kept for test.
-      official: the program by others that this world re-implements, to compare it with [none].
+      num_test_tasks: number of test tasks.
+      official: the official program by others that this world re-implements, for comparisons [none].
     """
 
     name: str
@@ -131,15 +132,15 @@ class World:
 
 @dataclass(frozen=True, kw_only=True)
 class Encoder:
-    """How a network turns an observation into a token.
+    """The record of an encoder, which embeds an observation as a token.
 
     Attributes:
-      name: what ``--encoder`` calls it.
-      make: ``(shape of an observation, width of a token, layout of an observation) -> module``. The module
-        (Flax) maps observations ``[*batch, ...]`` to tokens ``[*batch, E]``. The layout is None unless
+      name: its name, as given to ``--encoder``.
+      make: ``(shape of an observation, width of a token, layout of an observation) -> module``. The Flax
+        module maps observations ``[*batch, ...]`` to tokens ``[*batch, E]``. The layout is None unless
         ``uses_layout``.
-      uses_layout: whether it asks for the layout of observations (``EnvSpec.layout``). What is coded is no
-        amount: such observations are not standardized and get no noise.
+      uses_layout: whether it needs the layout of observations (``EnvSpec.layout``). Since codes are
+        categorical, such observations are not standardized and get no noise.
       fault: ``(layout, shape) -> text``, what is wrong with observations of this layout and shape, as the
         end of a sentence about the layout; None if nothing is.
     """
@@ -163,7 +164,7 @@ class Registry(Generic[Record]):
         self._loaded: dict[str, Record] = {}  # by place
 
     def register(self, record: Record) -> Record:
-        """Make a record known under its name; returns it.
+        """Register a record under its name; returns the record.
 
         Raises:
           UsageError: if another record has that name.
@@ -175,7 +176,7 @@ class Registry(Generic[Record]):
         return record
 
     def names(self) -> list[str]:
-        """All names, the built-in ones first; nothing is imported for it."""
+        """All names, the built-in ones first, without importing anything."""
         found = [point.name for point in entry_points(group=self.group)]
         return list(dict.fromkeys([*self._places, *self._registered, *found]))
 
@@ -188,10 +189,10 @@ class Registry(Generic[Record]):
         return found
 
     def find(self, name: str) -> Record:
-        """The record of that name.
+        """The record of a name, which may also be a place ``module:attribute``.
 
         Raises:
-          UsageError: if there is none, with the nearest name, or if it cannot be imported.
+          UsageError: if there is no such record (suggests the nearest name), or it cannot be imported.
         """
         if name in self._registered:
             return self._registered[name]
@@ -206,12 +207,15 @@ class Registry(Generic[Record]):
         return self._loaded[place]
 
     def known(self, name: str, where: object, flag: str = "") -> Record:
-        """The record of a name that was read from a file, which is data: no module is imported for it.
+        """The record of a name that was read from a file.
+
+        Since files are untrusted, no module is imported because of it.
 
         Args:
-          name: a registered name, that of an entry point, or that or the place of a record in use already.
+          name: a registered name, the name of an entry point, or the name or place of a record that is
+            loaded already.
           where: the file, for messages.
-          flag: the flag with which a user can name the record, for messages (default: there is none).
+          flag: the flag with which the user can name the record, for messages (default: there is none).
 
         Raises:
           DataError: if no such record is known.
@@ -236,7 +240,7 @@ class Registry(Generic[Record]):
         module, _, attribute = place.partition(":")
         here = os.getcwd()
         if here not in sys.path:
-            sys.path.append(here)  # last, so that the current folder never shadows a package
+            sys.path.append(here)  # last, so that the current directory never shadows a package
         try:
             record = getattr(importlib.import_module(module), attribute)
         except (ImportError, AttributeError, ValueError) as error:
@@ -254,7 +258,7 @@ class Registry(Generic[Record]):
         if taken is None and self._places.get(name, place) != place:
             taken = self.find(name)
         if taken is not None and taken is not record:
-            # Files are kept under names: another record of that name would use what is not its own.
+            # Files are stored by name, so two records of the same name would share their files.
             raise UsageError(
                 f"{place} has the name of the {self.kind} {name!r}; give it another one"
             )
@@ -280,11 +284,11 @@ WORLDS: Registry[World] = Registry(
 )
 
 ENCODER_PLACES = {"crafter-picture": "envs.crafter:PICTURE"}
-"""The encoders that worlds bring, by name: the places of their records."""
+"""The places of the encoders that worlds define, by name."""
 
 
 def register(world: World) -> World:
-    """Make a world known under its name; returns it."""
+    """Register a world under its name; returns the world."""
     return WORLDS.register(world)
 
 
@@ -302,7 +306,7 @@ def make(name: str) -> Environment:
     """The environment of a world, by its name or as ``module:attribute``.
 
     Raises:
-      UsageError: if there is no such world, or what it needs is not installed.
+      UsageError: if there is no such world, or packages that it needs are not installed.
     """
     try:
         return find(name).make()

@@ -1,13 +1,13 @@
 """The worlds as gymnasium environments: ``gymnasium.make("mgpo_jax/maze15-v0")``.
 
-They are registered when this module is imported, which gymnasium's ``gymnasium.register_envs`` is for:
+They are registered when this module is imported, for which gymnasium has ``gymnasium.register_envs``:
 
     import gymnasium, envs.to_gymnasium
     gymnasium.register_envs(envs.to_gymnasium)
 
-An observation is a dict of ``observation``, ``achieved_goal`` and ``desired_goal``, as gymnasium-robotics'
-``GoalEnv`` has it; the desired goal is that of the task, which does not tell everything. There is no
-``compute_reward``: what a world pays depends on more than two goals.
+An observation is a dict of ``observation``, ``achieved_goal`` and ``desired_goal``, as in the ``GoalEnv``
+of gymnasium-robotics. The desired goal is the task goal, which does not reveal everything about the task.
+There is no ``compute_reward``, since the reward of a world depends on more than two goals.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ KEYS = 2**32
 
 
 class WorldEnv(gymnasium.Env):
-    """A world of this project, stepped by hand.
+    """A world of this project as a gymnasium environment.
 
-    ``reset(seed=..)`` draws a task, and the chance of its episode. ``reset(options={"task": task})`` has
-    the episode on a task of yours; ``options={"same_task": True}`` on the last one. ``info`` tells
-    ``goal_reached``, whether the achieved goal counts, ``outcome``, the goal that this episode would have
-    in hindsight, and ``failed``, whether the world broke down.
+    ``reset(seed=..)`` draws a task and the random key of the episode. ``reset(options={"task": task})``
+    begins an episode on a given task, and ``options={"same_task": True}`` one on the last task. ``info``
+    holds ``goal_reached`` (whether the achieved goal counts as reached), ``outcome`` (the task goal that
+    this episode would accomplish in hindsight) and ``failed`` (whether the simulation failed).
 
     Args:
-      world: its name or place, its record, or an environment of it.
+      world: the world, as its name, place, record or environment.
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012 (the form that gymnasium asks for)
+    metadata = {"render_modes": []}  # noqa: RUF012 (the form that gymnasium requires)
 
     def __init__(self, world: str | World | Environment) -> None:
         if isinstance(world, Environment):
@@ -74,17 +74,17 @@ class WorldEnv(gymnasium.Env):
         if self.task is None:
             self.task = draw(key_task)
         self._goal = np.asarray(goal_of(self.task), np.float32)
-        self._state, told = reset(key, self.task)
-        return self._observed(told), _info(told)
+        self._state, timestep = reset(key, self.task)
+        return self._observed(timestep), _info(timestep)
 
     def step(self, action: Any) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         zero = self.world.spec.zero_action()
-        self._state, told = self._programs[3](self._state, jnp.asarray(action, zero.dtype))
-        flags = bool(told.terminated), bool(told.truncated)
-        return self._observed(told), float(told.reward), *flags, _info(told)
+        self._state, timestep = self._programs[3](self._state, jnp.asarray(action, zero.dtype))
+        flags = bool(timestep.terminated), bool(timestep.truncated)
+        return self._observed(timestep), float(timestep.reward), *flags, _info(timestep)
 
     def _chosen(self, options: Mapping[str, Any]) -> Task | None:
-        """The task that options of a reset ask for; None draws one."""
+        """The task that the options of a reset specify; None to draw one."""
         if unknown := set(options) - {"task", "same_task"}:
             raise UsageError(
                 f"options of reset are task and same_task, found {', '.join(sorted(unknown))}"
@@ -99,33 +99,34 @@ class WorldEnv(gymnasium.Env):
         self.world.check_task(jax.tree.map(lambda leaf: np.asarray(leaf)[None], task))
         return jax.tree.map(jnp.asarray, task)
 
-    def _observed(self, told: TimeStep) -> dict[str, np.ndarray]:
+    def _observed(self, timestep: TimeStep) -> dict[str, np.ndarray]:
         return {
-            "observation": np.array(told.obs),
-            "achieved_goal": np.array(told.achieved_goal),
+            "observation": np.array(timestep.obs),
+            "achieved_goal": np.array(timestep.achieved_goal),
             "desired_goal": self._goal.copy(),
         }
 
 
 def _box(obs: ArraySpec) -> spaces.Box:
-    """All observations of a shape and dtype."""
+    """The space of all observations with a shape and dtype."""
     dtype: Any = np.dtype(obs.dtype)
     if obs.is_float:
         return spaces.Box(-np.inf, np.inf, obs.shape, dtype)
     return spaces.Box(np.iinfo(dtype).min, np.iinfo(dtype).max, obs.shape, dtype)
 
 
-def _info(told: TimeStep) -> dict[str, Any]:
+def _info(timestep: TimeStep) -> dict[str, Any]:
     return {
-        "goal_reached": bool(told.goal_reached),
-        "outcome": np.array(told.outcome),
-        "failed": bool(told.failed),
+        "goal_reached": bool(timestep.goal_reached),
+        "outcome": np.array(timestep.outcome),
+        "failed": bool(timestep.failed),
     }
 
 
 @cache
 def _programs(env: Environment) -> tuple[Any, Any, Any, Any]:
-    """Drawing a task, its goal, reset and step, compiled once for equal worlds."""
+    """The jitted functions ``sample_task``, ``task_goal``, ``reset`` and ``step``, shared by equal
+    worlds."""
     compiled = jax.jit(compiler_options=dict(env.engine.compiler_options))
     return (
         compiled(env.sample_task),
@@ -136,7 +137,7 @@ def _programs(env: Environment) -> tuple[Any, Any, Any, Any]:
 
 
 def register(*names: str) -> None:
-    """Make worlds known to gymnasium as ``mgpo_jax/NAME-v0``; a place is known by its world's name."""
+    """Register worlds, given by name or place, with gymnasium as ``mgpo_jax/NAME-v0``."""
     for name in names:
         own = envs.registry.find(name).name
         identity = f"{NAMESPACE}/{own}-v{VERSION}"

@@ -1,4 +1,4 @@
-"""Worlds around other worlds."""
+"""Wrappers: worlds that modify other worlds."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from envs.errors import UsageError
 
 @dataclass(frozen=True)
 class Wrapper(Environment):
-    """Passes everything on to ``env``; subclasses change what they are about."""
+    """Delegates everything to ``env``; subclasses override what they change."""
 
     env: Environment
 
@@ -75,7 +75,7 @@ class Wrapper(Environment):
 
 
 class NoisyState(NamedTuple):
-    """The state of the world behind the noise, and the key of the noise to come."""
+    """The state of the wrapped world, and the random key of the noise in later steps."""
 
     inner: State
     key: PRNGKeyArray
@@ -83,14 +83,14 @@ class NoisyState(NamedTuple):
 
 @dataclass(frozen=True)
 class Noisy(Wrapper):
-    """A world behind noise on what the agent sees or does (paper, Table 3).
+    """A world with noise on observations and actions (paper, Table 3).
 
     Attributes:
       obs_noise: standard deviation of Gaussian noise on every component of an observation, in its units.
-      action_noise: standard deviation of the noise on continuous actions, which are clipped to [-1, 1]
-        again; a discrete action is replaced by a random one with this probability.
-      obs_range: half widths of uniform noise on each component of an observation, in their units and in
-        the order of the flattened observation; empty for none.
+      action_noise: standard deviation of Gaussian noise on continuous actions, which are then clipped to
+        [-1, 1] again; the probability with which a discrete action is replaced by a random one.
+      obs_range: half widths of uniform noise on each component of the flattened observation, in its units;
+        empty for none.
     """
 
     obs_noise: float = 0.0
@@ -102,7 +102,7 @@ class Noisy(Wrapper):
         if not all(0 <= size < math.inf for size in sizes):
             raise ValueError(
                 f"noise must be finite and not negative, found {self.obs_noise} on observations and "
-                f"{self.action_noise} on actions{self._range_told()}"
+                f"{self.action_noise} on actions{self._range_text()}"
             )
         if len(self.obs_range) not in (0, self.env.spec.obs.size):
             raise ValueError(
@@ -123,8 +123,8 @@ class Noisy(Wrapper):
                 f"noise on observations needs amounts, those of {self.env.spec.name} are codes and counts"
             )
 
-    def _range_told(self) -> str:
-        """The widths of uniform noise in a message."""
+    def _range_text(self) -> str:
+        """The widths of uniform noise as text for a message."""
         if not self.obs_range:
             return ""
         return f", uniform within {min(self.obs_range)} to {max(self.obs_range)} on observations"
@@ -168,10 +168,10 @@ class Noisy(Wrapper):
 def behind_noise(
     env: Environment, obs_noise: float = 0.0, action_noise: float = 0.0
 ) -> Environment:
-    """A world behind noise of these sizes (``Noisy``), and the world itself where both are 0.
+    """Wrap a world in noise of these sizes (``Noisy``); returns the world itself if both are 0.
 
     Raises:
-      UsageError: if the world cannot be behind such noise.
+      UsageError: if such noise cannot be applied to the world.
     """
     if not (obs_noise or action_noise):
         return env

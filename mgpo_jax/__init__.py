@@ -1,8 +1,8 @@
 """Pre-trained multi-goal Transformers with prompt optimization.
 
-This is the public interface: load a policy, make or register a world, adapt to tasks, evaluate prompts,
-act step by step outside of any program, pre-train on a dataset. Importing the package imports no jax; every
-name is loaded when it is first used.
+This is the public interface: load a policy, make or register a world, adapt to tasks, evaluate prompts, act
+step by step outside of compiled programs, pre-train on a dataset. Importing the package does not import
+jax; every name is loaded when it is first used.
 """
 
 from __future__ import annotations

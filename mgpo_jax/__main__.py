@@ -1,7 +1,7 @@
-"""``python -m mgpo_jax COMMAND FLAGS`` is the console script ``mgpo``, in any folder.
+"""``python -m mgpo_jax COMMAND FLAGS`` does the same as the console script ``mgpo``, from any folder.
 
-``python -m experiments.COMMAND`` is for a clone: a folder named ``experiments`` in the current one comes
-before ours. Here the current folder is searched last.
+``python -m experiments.COMMAND`` works only in a clone: elsewhere a folder named ``experiments`` in the
+current directory would be found before this project's. Here the current directory is searched last.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Acting step by step under a prompt, outside of any program: on a robot, or in a gymnasium loop."""
+"""Acting step by step under a prompt, outside of compiled programs: on a robot, or in a gymnasium loop."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from mgpo_jax.transformer import TransformerConfig
 
 @cache
 def _compiled(config: TransformerConfig) -> tuple[Any, Any]:
-    """Prefill and decode with the weights as data, so that policies of one network share them."""
+    """Jitted prefill and decode with the parameters as arguments, so that policies of one config share
+    them."""
 
     def prefill(params: Any, prompt: Prompt, obs: jax.Array) -> Any:
         return transformer_policy(config, params).prefill(prompt, obs)
@@ -31,9 +32,9 @@ def _compiled(config: TransformerConfig) -> tuple[Any, Any]:
 
 
 class Actor:
-    """A policy that acts in a world which somebody else steps.
+    """A policy that acts in an environment which the caller steps.
 
-    It remembers the episode, so observations are given one at a time and in order:
+    The actor keeps the history of the episode, so it is given one observation at a time, in order:
 
         actor = Actor(load_policy(world), goals)
         action = actor.reset(obs)
@@ -43,9 +44,9 @@ class Actor:
 
     Args:
       policy: a loaded policy.
-      goals: the prompt, a ``Prompt`` or an array ``[k, G]`` of goals whose last is the task goal.
-      greedy: whether to act by the likeliest action instead of exploring.
-      seed: seed of the exploration.
+      goals: the prompt, a ``Prompt`` or an array ``[k, G]`` of goals, of which the last is the task goal.
+      greedy: whether to take the most likely action instead of exploring.
+      seed: random seed of the exploration.
     """
 
     def __init__(
@@ -63,7 +64,7 @@ class Actor:
 
     @property
     def prompt(self) -> Prompt:
-        """The prompt of the next episode; it may be set to another one between two episodes."""
+        """The prompt; it may be replaced between two episodes."""
         return self._prompt
 
     @prompt.setter
@@ -78,17 +79,17 @@ class Actor:
         self._prompt = prompt
 
     def reset(self, obs: Any) -> np.ndarray:
-        """The first action of a new episode."""
+        """Begin a new episode with its first observation; returns the first action."""
         distribution, self._carry = self._prefill(self._prompt, self._checked(obs))
         self._step, self._room = 1, 0
         return self._choose(distribution)
 
     def act(self, obs: Any) -> np.ndarray:
-        """The next action of the episode.
+        """Continue the episode with the next observation; returns the next action.
 
         Raises:
-          UsageError: before ``reset``, for an observation of another shape or with NaN in it, or when the
-            episode is longer than the policy was trained for.
+          UsageError: if it is called before ``reset``, the observation has another shape or holds NaN, or
+            the episode is longer than the policy was trained for.
         """
         horizon = self.config.horizon
         if not self._step:
@@ -98,7 +99,8 @@ class Actor:
                 f"the policy was trained for episodes of {horizon} steps; call reset to begin another"
             )
         if not self._room:
-            # As in the episode loop, room is made for some steps at a time: each size is compiled once.
+            # As in the episode loop, the cache grows by several steps at a time, since each size is
+            # compiled.
             self._room = min(segment_length(horizon), horizon - self._step)
             self._carry = self._functions.grow(self._carry, self._room)
         distribution, self._carry = self._decode(self._carry, self._action, self._checked(obs))

@@ -1,6 +1,6 @@
-"""Online adaptation: ask an adapter who acts, run an episode, tell it the result (paper, section 3.2).
+"""Online adaptation: ask an adapter what to run, run it, tell it the result (paper, section 3.2).
 
-Everything here is for one task; callers ``vmap`` over tasks and seeds.
+Everything here is written for one task; callers ``vmap`` over tasks and seeds.
 """
 
 from __future__ import annotations
@@ -20,31 +20,31 @@ from mgpo_jax.trees import choose, put_row
 
 
 class Adapter(NamedTuple):
-    """Whatever adapts to a task: pure functions over a state of its own, for one task.
+    """A method that adapts to one task, as pure functions over an explicit state.
 
-    A *choice* is a small pytree that says who acts in an episode: a prompt, a flag, an index.
+    A *choice* is a small pytree that selects how the next episodes are acted: a prompt, a flag or an index.
     """
 
     init: Callable[[PRNGKeyArray, Float[Array, "G"]], Any]
     """``(key, task_goal) -> state``."""
     ask: Callable[[PRNGKeyArray, Any], tuple[Any, Any]]
-    """``(key, state) -> (choice, state)``: who is to act in the next round."""
+    """``(key, state) -> (choice, state)``: the choice to run in the next round."""
     agent: Callable[[Any, Any], Agent]
-    """``(state, choice) -> agent``, which the one episode loop runs."""
+    """``(state, choice) -> agent``: the agent that ``envs.episodes.run_episode`` runs for a choice."""
     tell: Callable[[PRNGKeyArray, Any, Any, Episode], Any]
-    """``(key, state, choice, episodes) -> state``; ``episodes`` has a leading axis, the episodes of the
-    round."""
+    """``(key, state, choice, episodes) -> state``: the update. The leading axis of ``episodes`` is the
+    K episodes of the round."""
     best: Callable[[Any], Any]
-    """``(state) -> choice``: the best one so far. It is judged in episodes outside of the budget, as the
-    world's record says."""
+    """``(state) -> choice``: the best choice so far. It is judged in episodes that do not count against the
+    budget, as the world's record (``Judgement``) prescribes."""
     episodes_per_round: int = 1
-    """Episodes that one choice is asked for. All of them count."""
+    """K, the number of episodes that are run with each choice. All of them count against the budget."""
     tell_in_turn: bool = False
-    """Whether tasks that adapt side by side update one after the other, which saves memory where an
+    """Whether ``vmap`` over tasks runs ``tell`` for one task after another. This saves memory where an
     update is large."""
     num_scored: Callable[[Any], Int[Array, ""]] | None = None
-    """``(state) -> number`` of prompts that it scored so far by asking the policy, without an episode; None
-    for those that learn by episodes alone."""
+    """``(state) -> number`` of prompts that were scored by the policy's likelihoods so far, without running
+    an episode; None for methods that learn from episodes alone."""
 
 
 class AdaptState(NamedTuple):
@@ -56,40 +56,42 @@ class AdaptState(NamedTuple):
 
 
 class Played(NamedTuple):
-    """What is kept of an episode so that it can be shown and played again."""
+    """The part of an episode that is kept, from which it can be drawn and replayed."""
 
     key: Shaped[Array, "*batch"]
     """The episode's random key, for ``envs.episodes.replay``."""
     actions: Array | None
-    """``[T]`` small integers; the largest that the type holds stands in places after the end."""
+    """Actions ``[.., T]``, as ``small_actions`` encodes them; None if they were not kept."""
     goals: Goals
 
 
 class AdaptLog(NamedTuple):
-    """What happened in R consecutive rounds of K episodes."""
+    """The record of R consecutive rounds of K episodes."""
 
     returns: Float[Array, "*batch R K"]
     failed: Bool[Array, "*batch R K"]
-    """Whether the world broke down."""
+    """Whether the episode ended because the simulation failed."""
     choices: Any
-    """Who acted, [R, ..]."""
+    """The choice of each round, [R, ..]."""
     best: Any
     """The best choice after each round, [R, ..]."""
     played: Played
     """The episodes, [R, K, ..]."""
     num_scored: Int[Array, "*batch R"] | None = None
-    """Prompts that were scored without an episode until the end of each round; None where none can be."""
+    """Cumulative number of prompts scored without an episode at the end of each round; None if the method
+    scores none (``Adapter.num_scored``)."""
 
 
 class Judged(NamedTuple):
-    """The best choice in episodes outside of the budget."""
+    """How well the best choice did in judging episodes, which do not count against the budget."""
 
     return_: Float[Array, "*batch"]
     """Mean return."""
     num_failed: Int[Array, "*batch"]
-    """How many episodes ended because the world broke down."""
+    """Number of episodes that ended because the simulation failed."""
     achieved: Float[Array, "*batch M"] | None = None
-    """Share of the episodes that achieved each of the world's M named goals; None in worlds without any."""
+    """Fraction of the episodes that achieved each of the world's M named goals; None in worlds without
+    named goals."""
 
 
 def judge(
@@ -97,16 +99,19 @@ def judge(
     failed: Bool[Array, "J"],
     achieved: Bool[Array, "J M"] | None,
 ) -> Judged:
-    """Mean return, number of failed episodes, and share that achieved each named goal, of J episodes.
+    """Summarize J judging episodes.
 
-    ``achieved`` is that of ``achieved_goals``.
+    Args:
+      returns: their returns.
+      failed: whether each ended because the simulation failed.
+      achieved: which of the M named goals each achieved (``achieved_goals``), or None.
     """
     shares = None if achieved is None else jnp.mean(achieved, axis=0)
     return Judged(returns.mean(), failed.sum(), shares)
 
 
 def achieved_goals(env: Environment, goals: Goals | Trajectory) -> Bool[Array, "M"] | None:
-    """Which of the world's M named goals an episode has achieved at its end; None without names."""
+    """Which of the world's M named goals an episode has achieved by its end; None if no goals are named."""
     num = len(env.goal_names)
     return hindsight_outcome(goals)[:num] > 0.5 if num else None
 
@@ -116,11 +121,11 @@ class AdaptResult(NamedTuple):
 
     log: AdaptLog
     best: Any
-    """The choice that the search ends with, such as the optimized prompt."""
+    """The best choice at the end of the search, such as the optimized prompt."""
 
 
 def start(key: PRNGKeyArray, env: Environment, adapter: Adapter, task: Task) -> AdaptState:
-    """The state before the first episode on ``task``."""
+    """The state of an adaptation before its first episode on ``task``."""
     key_init, key_run = jax.random.split(key)
     return AdaptState(key_run, adapter.init(key_init, env.task_goal(task)))
 
@@ -162,26 +167,30 @@ def proceed(
     keep_actions: bool = False,
     stopped: Bool[Array, ""] | None = None,
 ) -> tuple[AdaptState, AdaptLog, Judged]:
-    """The next rounds of a search, and then episodes that judge its best choice.
+    """Run the next rounds of a search, and then the episodes that judge its best choice.
 
-    Searching and judging are one loop, so that a program holds the code of an episode once.
+    Searching and judging share one loop, so that the code of an episode is compiled only once.
 
     Args:
       state: the adaptation so far.
       env: the world (static).
-      adapter: who adapts.
+      adapter: the method that adapts.
       task: the task.
       num_rounds: number of rounds to run (traced).
-      max_rounds: room in the log; the entries from ``num_rounds`` on are meaningless.
+      max_rounds: number of rounds that the log has room for (static); its entries from ``num_rounds`` on
+        are meaningless.
       judge_key: random key of the judging episodes (default: none are run).
-      num_judged: number of the judging episodes (static).
-      keep_actions: whether the log also keeps continuous actions.
-      stopped: whether the search has ended before: then episodes have no steps and nothing changes
-        (default: it has not, which costs no test).
+      num_judged: number of judging episodes (static).
+      keep_actions: whether the log keeps continuous actions, too; discrete actions are always kept.
+      stopped: whether the search had already ended. Then its episodes have no steps and its state does not
+        change. None, the default, means that no search ends early, and compiles no test for it.
+
+    Returns:
+      The new state, the log of the rounds, and the judgement (NaN if no episodes judge).
     """
     judge_keys = None if judge_key is None else jax.random.split(judge_key, num_judged)
 
-    @jax.jit  # traced once: for the shapes of the log, and in the loop
+    @jax.jit  # so that the shapes of the log and the loop below share one trace
     def entry(state: AdaptState, index: Array) -> tuple[AdaptState, AdaptLog]:
         searching = jnp.ones((), bool) if judge_keys is None else index < num_rounds
         own_key = None if judge_keys is None else judge_keys[jnp.maximum(index - num_rounds, 0)]
@@ -216,7 +225,7 @@ def _round(
     keep_actions: bool,
     stopped: Bool[Array, ""] | None,
 ) -> tuple[AdaptState, AdaptLog]:
-    """One round of the search, or (not ``searching``) one judging episode, which changes nothing."""
+    """Run one round of the search or, if not ``searching``, one judging episode, which keeps the state."""
     key, key_ask, key_run, key_tell = jax.random.split(state.key, 4)
     choice, asked = adapter.ask(key_ask, state.search)
     num = adapter.episodes_per_round
@@ -225,7 +234,7 @@ def _round(
         choice, asked = choose(
             searching, (choice, asked), (adapter.best(state.search), state.search)
         )
-        # The same judging episodes for every method, however many episodes its rounds have.
+        # All methods are judged with the same keys, however many episodes their rounds have.
         judge_keys = jnp.broadcast_to(judge_key, keys.shape)
         key, keys = choose(searching, (key, keys), (state.key, judge_keys))
     if stopped is not None:
@@ -236,11 +245,11 @@ def _round(
     wanted = jnp.where(searching, num, 1)
     episodes = _episodes(keys, env, agent, task, wanted)
 
-    def told() -> Any:
+    def update() -> Any:
         tell = in_turn(adapter.tell) if adapter.tell_in_turn else adapter.tell
         return tell(key_tell, asked, choice, episodes)
 
-    after = told() if judge_key is None else jax.lax.cond(searching, told, lambda: state.search)
+    after = update() if judge_key is None else jax.lax.cond(searching, update, lambda: state.search)
     if stopped is not None:
         after = choose(stopped, state.search, after)
     kept = env.spec.discrete or keep_actions
@@ -260,7 +269,7 @@ def _round(
 
 
 def idle_when(stopped: Bool[Array, ""], agent: Agent) -> Agent:
-    """The agent, which quits before its first step where its search has ended."""
+    """The same agent, except that it quits before its first step if its search has ended (``stopped``)."""
 
     def begin(key: PRNGKeyArray, task: Task, state: Any, timestep: Any) -> tuple[Any, Any, Any]:
         action, quits, memory = agent.begin(key, task, state, timestep)
@@ -270,10 +279,10 @@ def idle_when(stopped: Bool[Array, ""], agent: Agent) -> Agent:
 
 
 def in_turn(function: Callable) -> Callable:
-    """The same function, which ``vmap`` computes for one lane after the other.
+    """The same function, except that ``vmap`` evaluates it for one lane after another.
 
-    What it closes over becomes an argument: ``sequential_vmap`` by itself accepts nothing there that
-    differs between lanes, such as the hyper-parameters of a sweep.
+    Traced values that ``function`` closes over are turned into arguments, because ``sequential_vmap``
+    cannot batch over closed-over values such as the hyper-parameters of a sweep.
     """
 
     def call(*args: Any) -> Any:
@@ -292,7 +301,7 @@ def in_turn(function: Callable) -> Callable:
 def _episodes(
     keys: Key[Array, "K"], env: Environment, agent: Agent, task: Task, wanted: Int[Array, ""]
 ) -> Episode:
-    """The first ``wanted`` episodes of ``agent``, one for each of the keys [K]; the others are zeros."""
+    """Run the first ``wanted`` of K episodes, one for each key; the rows of the others are zeros."""
     if len(keys) == 1:
         only = run_episode(keys[0], env, agent, task)
         return jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], only)
@@ -306,10 +315,10 @@ def _episodes(
 
 
 def small_actions(spec: EnvSpec, episodes: Episode) -> Array:
-    """Actions of episodes in as few bytes as they need; continuous ones as they are.
+    """The actions of episodes in a compact encoding.
 
-    Discrete actions have one byte, or two where there are more than 255 of them; the largest number that
-    the type holds stands in the places after the end of an episode.
+    Discrete actions become uint8, or uint16 in worlds with more than 255 actions; the places after the end
+    of an episode hold the largest value of that type. Continuous actions are returned unchanged.
     """
     actions = episodes.trajectory.actions
     if not spec.discrete:
@@ -320,7 +329,7 @@ def small_actions(spec: EnvSpec, episodes: Episode) -> Array:
 
 
 def _zeros(shape: tuple[int, ...], dtype: Any) -> Array:
-    """Zeros, or random keys of zeros."""
+    """An array of zeros; for the dtype of random keys, an array of the key with seed 0."""
     if jnp.issubdtype(dtype, jax.dtypes.prng_key):
         return jnp.broadcast_to(jax.random.key(0, impl=dtype._impl.name), shape)
     return jnp.zeros(shape, dtype)

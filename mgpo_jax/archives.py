@@ -1,10 +1,10 @@
-"""Arrays in files: what they must look like, and how they are read, with faults as plain sentences.
+"""Reading arrays from untrusted files, with a schema and with faults reported as plain sentences.
 
 ``ArrayField`` declares an array of an npz file: its axes, its kind of numbers and their range.
-``read_arrays`` reads all such files but those of ``journal``, which hold their own hash. It compares what
-the headers claim with what is declared and with the size of the file before it allocates any memory, runs
-nothing that a file holds, and converts what is valid but foreign, such as big-endian numbers.
-``mapped_arrays`` does the same for arrays in npy files, which it maps into memory as they are.
+``read_arrays`` reads all such files except those of ``journal``, which hold their own hash. Before it
+allocates any memory, it compares the headers with the declaration and with the size of the file. It never
+executes anything from a file, and converts valid but foreign data, such as big-endian numbers.
+``mapped_arrays`` does the same for arrays in npy files, which it maps into memory without conversion.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from mgpo_jax.schema import tail_of
 MAX_MEMBERS = 10_000
 MAX_HEADER = 4096  # bytes; numpy writes 118
 FREE, MAX_RATIO = 512 << 20, 100
-"""Arrays whose sizes are not known beforehand may have ``FREE`` bytes together, or ``MAX_RATIO`` times
-those of their file."""
-DEFLATE = 1032  # bytes that one deflated byte can stand for
+"""Arrays whose sizes are not known beforehand may together unpack to ``FREE`` bytes, or to ``MAX_RATIO``
+times the size of their file, whichever is more."""
+DEFLATE = 1032  # largest compression ratio of the deflate format
 CHUNK = 1 << 20  # bytes that are read, checked and converted at a time
-LARGEST = 1e18  # of a number, unless its field says otherwise
+LARGEST = 1e18  # largest magnitude of a number, unless its field says otherwise
 _KINDS = {"integers": "iu", "numbers": "iuf", "anything": "biuf"}
 _WORDS_OF_KINDS = {
     "b": "booleans",
@@ -48,22 +48,22 @@ _UNREADABLE = (
     OSError, EOFError, NotImplementedError, OverflowError, RuntimeError, ValueError, struct.error,
     zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error,
 )  # fmt: skip
-"""What ``zipfile`` raises for files that are damaged or use what it does not know."""
+"""The exceptions that ``zipfile`` raises for files that are damaged or use unsupported features."""
 
 
 @dataclass(frozen=True)
 class ArrayField:
-    """What one array of a file must look like.
+    """The declaration of one array of a file.
 
     Attributes:
-      shape: its axes. A number is a size. A word stands for the size that all axes of this name have, and
-        names them in messages. ``...`` at the end stands for any further axes.
-      dtype: the dtype that it is converted to, or ``integers``, ``numbers`` or ``anything`` (with
-        booleans): then it keeps its own. Integers are numbers, but no number is taken as an integer.
-      required: whether it has to be there.
-      low: its smallest value (default: the smallest of the dtype, -1e18 for floats).
-      high: its largest value, likewise.
-      any_value: whether it may hold anything, NaN and infinity included.
+      shape: its axes. A number is a size. A word is the name of a size, which is the same for all axes of
+        that name, and stands for the axis in messages. ``...`` at the end stands for any further axes.
+      dtype: the dtype that the array is converted to. With ``integers``, ``numbers`` or ``anything`` (which
+        includes booleans) it keeps its own dtype. Integers are accepted as numbers, but not the reverse.
+      required: whether the array must be present.
+      low: smallest allowed value (default: the smallest of the dtype, -1e18 for floats).
+      high: largest allowed value (default: the largest of the dtype, 1e18 for floats).
+      any_value: whether any value is allowed, including NaN and infinity.
     """
 
     shape: tuple[int | str | EllipsisType, ...]
@@ -75,7 +75,7 @@ class ArrayField:
 
     @property
     def kinds(self) -> str:
-        """The kinds of dtypes that can be converted to that of the field."""
+        """The numpy kinds (``dtype.kind``) that can be converted to the dtype of the field."""
         if self.dtype in _KINDS:
             return _KINDS[self.dtype]
         kind = np.dtype(self.dtype).kind
@@ -86,7 +86,7 @@ class ArrayField:
         return found.newbyteorder("=") if self.dtype in _KINDS else np.dtype(self.dtype)
 
     def limits(self, target: np.dtype) -> tuple[Any, Any]:
-        """The smallest and the largest value that an array may hold."""
+        """The smallest and the largest value that an array may hold after conversion to ``target``."""
         if target.kind == "f":
             most = min(LARGEST, float(np.finfo(target).max))
             least: Any = -most
@@ -100,13 +100,13 @@ class ArrayField:
 
 
 class ArrayHeader(NamedTuple):
-    """What is known of an array before it is read."""
+    """The header of an array, which is known before the array is read."""
 
     shape: tuple[int, ...]
     dtype: np.dtype
     fortran: bool = False
     offset: int = 0
-    """Bytes of the header."""
+    """Size of the header in bytes, after which the numbers begin."""
 
     @property
     def size(self) -> int:
@@ -118,14 +118,14 @@ Sizes = Mapping[str, int | range]
 
 
 class _FaultError(Exception):
-    """What is wrong with an npz file, to stand after its name."""
+    """A fault of an npz file; the text follows the file's name in a message."""
 
 
 def array_names(path: Path, mend: str = "") -> list[str]:
     """The names of the arrays in an npz file, from its directory alone.
 
     Raises:
-      DataError: if it is missing or no npz file.
+      DataError: if the file is missing or is not an npz file.
     """
     with _opened(path, mend) as archive:
         return list(_members(archive))
@@ -135,7 +135,7 @@ def array_headers(path: Path, mend: str = "") -> dict[str, ArrayHeader]:
     """Shapes and dtypes of the arrays in an npz file, without reading them.
 
     Raises:
-      DataError: if it is missing, no npz file, or an array cannot be as large as it claims.
+      DataError: if the file is missing or is not an npz file, or an array cannot be as large as it claims.
     """
     with _opened(path, mend) as archive:
         members = _members(archive)
@@ -148,7 +148,7 @@ def mapped_headers(folder: Path, names: Iterable[str], mend: str = "") -> dict[s
     """Shapes and dtypes of the arrays in the files ``NAME.npy`` of a folder, without reading them.
 
     Raises:
-      DataError: if one is missing, no npy file, or has another size than its header claims.
+      DataError: if a file is missing, is not an npy file, or has another size than its header claims.
     """
     found = {}
     for name in names:
@@ -177,16 +177,16 @@ def mapped_arrays(
     sizes: Sizes | None = None,
     mend: str = "",
 ) -> dict[str, np.ndarray]:
-    """Arrays in the files ``NAME.npy`` of a folder, as their fields say, mapped into memory to read.
+    """Map the arrays in the files ``NAME.npy`` of a folder into memory, read-only.
 
-    Nothing is converted, so dtypes have to be those of the fields. Values are checked piece by piece, and
-    what was looked at does not stay in memory. An empty array is none that can be mapped, and is made.
+    Nothing is converted, so dtypes must be those of the fields. Values are checked piece by piece, and
+    checked pieces do not stay in memory. An empty array cannot be mapped and is created instead.
 
     Args:
-      folder: where the files lie.
-      fields: what is wanted, by name. Those that are not required may be missing.
-      sizes: what is known of the sizes of axes.
-      mend: what mends a file that is not as it should be, the end of the message.
+      folder: the folder of the files.
+      fields: the arrays to map, by name. Those that are not required may be missing.
+      sizes: known sizes of axes, by name.
+      mend: how to mend a faulty file, the end of the message.
 
     Raises:
       DataError: if a file is missing or damaged, or an array differs from its field.
@@ -218,7 +218,8 @@ def _npy(folder: Path, name: str) -> Path:
 
 
 def _check_pieces(array: np.ndarray, name: str, header: ArrayHeader, field: ArrayField) -> None:
-    """``_check_values`` of all of an array, of which little is in memory at a time."""
+    """Apply ``_check_values`` to a whole array, piece by piece, so that little of it is in memory at a
+    time."""
     if field.any_value or header.dtype.kind == "b":
         return
     flat = array.reshape(-1)
@@ -229,14 +230,14 @@ def _check_pieces(array: np.ndarray, name: str, header: ArrayHeader, field: Arra
 
 
 RESIDENT = 64 << 20
-"""Bytes of a mapped array that may stay in memory."""
+"""Number of bytes of a mapped array that may stay resident in memory."""
 
 
 def let_go(array: np.ndarray) -> None:
-    """Take what was read of a large mapped array out of the process's memory.
+    """Drop the pages of a large mapped array from the process's resident memory.
 
-    It stays in the kernel's cache as long as there is room, so that reading it again is cheap. Without
-    this, a process seems to grow by every page that it has ever looked at.
+    They stay in the kernel's page cache as long as there is room, so that reading them again is cheap.
+    Without this, the process's reported memory grows by every page that it has ever touched.
     """
     base: Any = array
     while isinstance(base, np.ndarray):
@@ -253,14 +254,14 @@ def read_arrays(
     *,
     only: bool = False,
 ) -> dict[str, np.ndarray]:
-    """Arrays of an npz file, as their fields say; nothing else in the file is read.
+    """Read arrays of an npz file, checked and converted according to their fields.
 
     Args:
       path: the file.
-      fields: what is wanted, by name.
-      sizes: what is known of the sizes of axes.
-      mend: what mends a file that is not as it should be, the end of the message.
-      only: whether other arrays are an error.
+      fields: the arrays to read, by name; others are not read.
+      sizes: known sizes of axes, by name.
+      mend: how to mend a faulty file, the end of the message.
+      only: whether other arrays in the file are an error.
 
     Raises:
       DataError: if the file is missing or damaged, or an array differs from its field.
@@ -289,7 +290,7 @@ def fitted_arrays(
     sizes: Sizes | None = None,
     mend: str = "",
 ) -> dict[str, np.ndarray]:
-    """Arrays in memory, checked and converted like those that ``read_arrays`` reads.
+    """Check and convert arrays in memory, in the same way as ``read_arrays``.
 
     Raises:
       DataError: if an array is missing or differs from its field.
@@ -314,7 +315,7 @@ def fitted_arrays(
 
 @contextmanager
 def _opened(path: Path, mend: str) -> Iterator[zipfile.ZipFile]:
-    """An npz file to read; whatever is wrong with it becomes a ``DataError``."""
+    """Open an npz file for reading; any fault within the block becomes a ``DataError``."""
     if not path.is_file():
         raise DataError(f"{path} is missing{tail_of(mend)}")
     try:
@@ -333,7 +334,7 @@ def _damaged(name: str, what: str) -> _FaultError:
 
 
 def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    """What the archive holds, by the names of the arrays."""
+    """The members of an archive, by the names of the arrays."""
     infos = archive.infolist()
     if len(infos) > MAX_MEMBERS:
         raise _FaultError(f" is not a readable npz file: it has {len(infos)} members")
@@ -347,7 +348,7 @@ def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
 
 
 def _header(archive: zipfile.ZipFile, name: str, info: zipfile.ZipInfo) -> ArrayHeader:
-    """What a member says of its array, without reading it."""
+    """The header of the array in a member, without reading the array."""
     if info.flag_bits & 1:
         raise _damaged(name, "is encrypted")
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
@@ -360,7 +361,7 @@ def _header(archive: zipfile.ZipFile, name: str, info: zipfile.ZipInfo) -> Array
 
 
 def _read_header(name: str, file: Any) -> ArrayHeader:
-    """What the first bytes of an array in the format npy say of it."""
+    """Read the header from the first bytes of an array in npy format."""
     start = file.read(8)
     if start[:6] != b"\x93NUMPY":
         raise _damaged(name, "is no array")
@@ -393,7 +394,7 @@ def _parsed_header(name: str, text: bytes, offset: int) -> ArrayHeader:
 
 
 def _check_kinds(headers: Mapping[str, ArrayHeader], fields: Mapping[str, ArrayField]) -> None:
-    """Raise for arrays that are missing, or the first that has another kind of numbers than its field."""
+    """Raise if arrays are missing, or for the first array with another kind of numbers than its field."""
     missing = [name for name, field in fields.items() if field.required and name not in headers]
     if missing:
         raise _FaultError(f" lacks {', '.join(missing)}")
@@ -406,33 +407,38 @@ def _check_kinds(headers: Mapping[str, ArrayHeader], fields: Mapping[str, ArrayF
 def _check_shapes(
     headers: Mapping[str, ArrayHeader], fields: Mapping[str, ArrayField], sizes: Sizes
 ) -> None:
-    """Raise for the first array that has another shape than its field and those before it."""
-    known = {axis: _only(size) if isinstance(size, int) else size for axis, size in sizes.items()}
+    """Raise for the first array whose shape does not match its field, given the sizes of named axes so
+    far."""
+    known = {
+        axis: _exact_range(size) if isinstance(size, int) else size for axis, size in sizes.items()
+    }
     for name, header in headers.items():
         if not _fits(header.shape, fields[name], known):
-            wanted = ", ".join(_described(axis, known) for axis in fields[name].shape)
+            wanted = ", ".join(_axis_text(axis, known) for axis in fields[name].shape)
             raise _FaultError(f": {name} has shape {list(header.shape)}, wanted [{wanted}]")
 
 
-def _only(size: int) -> range:
+def _exact_range(size: int) -> range:
     return range(size, size + 1)
 
 
 def _fits(shape: Sequence[int], field: ArrayField, known: dict[str, range]) -> bool:
-    """Whether a shape is that of a field; sizes of axes that were not known are noted."""
+    """Whether a shape matches a field; sizes of named axes that were not known are added to ``known``."""
     axes = [axis for axis in field.shape if not isinstance(axis, EllipsisType)]
     if len(shape) < len(axes) or (len(shape) > len(axes) and ... not in field.shape):
         return False
     for axis, size in zip(axes, shape, strict=False):
-        if size not in (_only(axis) if isinstance(axis, int) else known.get(axis, _only(size))):
+        if size not in (
+            _exact_range(axis) if isinstance(axis, int) else known.get(axis, _exact_range(size))
+        ):
             return False
         if isinstance(axis, str):
-            known[axis] = _only(size)
+            known[axis] = _exact_range(size)
     return True
 
 
-def _described(axis: int | str | EllipsisType, known: Mapping[str, range]) -> str:
-    """An axis of a field in a message, with its size where it is known."""
+def _axis_text(axis: int | str | EllipsisType, known: Mapping[str, range]) -> str:
+    """An axis of a field as text for a message, with its size if that is known."""
     if not isinstance(axis, str):
         return "..." if isinstance(axis, EllipsisType) else str(axis)
     sizes = known.get(axis)
@@ -444,7 +450,7 @@ def _described(axis: int | str | EllipsisType, known: Mapping[str, range]) -> st
 def _check_claims(
     headers: Mapping[str, ArrayHeader], members: Mapping[str, zipfile.ZipInfo]
 ) -> None:
-    """Raise if an array cannot have the size that its header claims, before memory is taken for it."""
+    """Raise if an array cannot have the size that its header claims, before memory is allocated for it."""
     for name, header in headers.items():
         info = members[name]
         held = info.file_size - header.offset
@@ -463,7 +469,7 @@ def _check_unpacked_size(
     sizes: Sizes,
     file_size: int,
 ) -> None:
-    """Raise if a small file would fill the memory with arrays that nobody expects to be so large."""
+    """Raise if a small file would unpack to unexpectedly large arrays (a decompression bomb)."""
     total = sum(
         header.size * fields[name].target(header.dtype).itemsize
         for name, header in headers.items()
@@ -488,9 +494,9 @@ def _read_member(
     header: ArrayHeader,
     field: ArrayField,
 ) -> np.ndarray:
-    """Read one array; it is checked and converted piece by piece, so that it is never there twice."""
+    """Read one array, checked and converted piece by piece, so that it is never in memory twice."""
     array = np.empty(header.shape, field.target(header.dtype))
-    # Numbers lie in the order of the last axis, or of the first one for Fortran.
+    # Numbers are stored in C order (last axis fastest), or in Fortran order (first axis fastest).
     flat = array.T.flat if header.fortran else array.reshape(-1)
     step, itemsize, first = max(1, CHUNK // header.dtype.itemsize), header.dtype.itemsize, 0
     try:
@@ -507,10 +513,10 @@ def _read_member(
                     else np.frombuffer(raw, header.dtype)
                 )
                 _check_values(values, name, header, field, first)
-                with np.errstate(all="ignore"):  # where any value is allowed, it may be too large
+                with np.errstate(all="ignore"):  # with `any_value`, a number may overflow the dtype
                     flat[first : first + len(values)] = values
                 first += len(values)
-            file.read(1)  # compares the checksum of the member
+            file.read(1)  # reaching the end makes zipfile verify the checksum
     except _UNREADABLE:
         raise _damaged(name, "is damaged") from None
     return array
@@ -519,12 +525,13 @@ def _read_member(
 def _check_values(
     values: np.ndarray, name: str, header: ArrayHeader, field: ArrayField, first: int = 0
 ) -> None:
-    """Raise for the first of some numbers, counted from ``first``, that its field does not allow."""
+    """Raise for the first value that its field does not allow; ``first`` is the flat index of
+    ``values[0]``."""
     if field.any_value or values.dtype.kind == "b" or not len(values):
         return
     low, high = field.limits(field.target(header.dtype))
     with np.errstate(all="ignore"):
-        if values.min() >= low and values.max() <= high:  # neither is true of NaN
+        if values.min() >= low and values.max() <= high:  # false if there is a NaN
             return
         index = int(np.flatnonzero(~((values >= low) & (values <= high)))[0])
     value = values[index]

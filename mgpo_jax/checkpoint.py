@@ -1,8 +1,8 @@
-"""Training checkpoints (Orbax): everything that a run needs to go on as if it had never stopped.
+"""Training checkpoints (Orbax): everything that a run needs to resume as if it had never stopped.
 
-A checkpoint holds its own hash and the identity of its run, so that one that is damaged, or of another run,
-is never gone on from. Where several processes train together they have the same state: process 0 writes and
-reads it, and tells the others, so that a run can go on with another number of processes.
+A checkpoint holds its own hash and the identity of its run, so that a run is never resumed from a damaged
+checkpoint, or from that of another run. Processes that train together have the same state. Process 0 writes
+and reads it and sends it to the others, so that a run can be resumed with another number of processes.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ from mgpo_jax.files import hash_arrays
 from mgpo_jax.sharding import fetch
 from mgpo_jax.training import TrainState
 
-_HASH, _IDENTITY, _ROWS, _STEP = "sha256", "run", "rows", "step"  # beside the leaves of the state
-DAMAGED = "-damaged"  # ends the name of the folder where checkpoints are set aside
+_HASH, _IDENTITY, _ROWS, _STEP = "sha256", "run", "rows", "step"  # entries besides the state
+DAMAGED = "-damaged"  # suffix of the folder to which damaged checkpoints are moved
 
 
 class Snapshot(NamedTuple):
-    """What a checkpoint holds."""
+    """The contents of a checkpoint."""
 
     state: TrainState
     measured: list[dict[str, float]] | None
-    """The rows of metrics up to here; None if an older version saved it, which did not keep them."""
+    """The rows of metrics so far; None for a checkpoint of an older version, which did not keep them."""
     pending: list[dict[str, float]]
     """The metrics of the steps since the last row."""
 
 
 @contextmanager
 def checkpoints(folder: Path, keep: int = 2) -> Iterator[ocp.CheckpointManager]:
-    """An Orbax manager of this process alone. A save is on disk when it returns.
+    """An Orbax checkpoint manager for this process alone, which saves synchronously.
 
-    It becomes visible only when it is complete: a process killed in the middle of one leaves the
-    checkpoints before it.
+    A checkpoint becomes visible only when it is complete: a process that is killed while it saves leaves
+    the earlier checkpoints intact.
 
     Raises:
-      DataError: if there is a file where the folder should be.
+      DataError: if a file is in the place of the folder.
     """
     folder = Path(folder).absolute()
     if folder.exists() and not folder.is_dir():
@@ -76,7 +76,7 @@ def checkpoints(folder: Path, keep: int = 2) -> Iterator[ocp.CheckpointManager]:
 
 @contextmanager
 def _quiet(*names: str) -> Iterator[None]:
-    """Silence loggers: what matters of their warnings is raised as well, and said here in one line."""
+    """Silence loggers whose warnings only repeat what is also raised, and reported here in one line."""
     loggers = [logging.getLogger(name) for name in names]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
@@ -89,7 +89,7 @@ def _quiet(*names: str) -> Iterator[None]:
 
 
 def save_state(manager: ocp.CheckpointManager, snapshot: Snapshot, identity: str = "") -> None:
-    """Save a training under its step; ``identity`` says which run it is of (64 hexadecimal digits)."""
+    """Save a snapshot under its step. ``identity`` identifies the run (64 hexadecimal digits)."""
     rows = {"measured": snapshot.measured, "pending": snapshot.pending}
     saved = {
         **_named_leaves(snapshot.state),
@@ -101,7 +101,7 @@ def save_state(manager: ocp.CheckpointManager, snapshot: Snapshot, identity: str
 
 
 def _named_leaves(state: TrainState) -> dict[str, np.ndarray]:
-    """Leaves by path: what is on disk does not depend on the types of optax's records."""
+    """The leaves by path, so that the format on disk does not depend on the types of optax's states."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(fetch((state.params, state.opt_state)))
     return {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in leaves}
 
@@ -109,13 +109,17 @@ def _named_leaves(state: TrainState) -> dict[str, np.ndarray]:
 def restore_state(
     manager: ocp.CheckpointManager, blank: TrainState, identity: str | Collection[str] = ""
 ) -> Snapshot | None:
-    """The newest sound checkpoint, or None if there is none.
+    """The newest intact checkpoint, or None if there is none.
 
-    Those that are damaged are set aside, with a line on stderr that says so. ``identity`` is that of the
-    run, or those that it may have; empty where any is right.
+    Damaged checkpoints are moved aside, and a line on stderr says so.
+
+    Args:
+      manager: the checkpoint manager.
+      blank: a state of the same network, for its structure and shapes.
+      identity: the identity of the run, or all identities that it may have; empty if any is accepted.
 
     Raises:
-      DataError: if it is of another run or another network.
+      DataError: if the checkpoint is of another run or another network.
     """
     root = Path(manager.directory)
     for step in sorted(manager.all_steps(), reverse=True):
@@ -124,10 +128,10 @@ def restore_state(
             found = {k: np.asarray(v) for k, v in _read(manager, step).items()}
             _check_hash(found)
         except Exception as error:  # Orbax raises many kinds for a damaged file
-            if isinstance(error, MemoryError) or _is_of_the_machine(error):
+            if isinstance(error, MemoryError) or _is_machine_error(error):
                 raise  # the file may be sound
             _set_aside(where, root.with_name(root.name + DAMAGED))
-            manager.reload()  # else it refuses to save steps up to the one that is gone
+            manager.reload()  # otherwise it refuses to save steps before the removed one
             continue
         known = [identity] if isinstance(identity, str) else identity
         if identity and _IDENTITY in found and found[_IDENTITY].tobytes().hex() not in known:
@@ -140,11 +144,11 @@ def restore_state(
 
 
 def state_of_first(state: TrainState | None, blank: TrainState) -> TrainState:
-    """The state that process 0 has, on every process.
+    """Broadcast the state of process 0 to all processes.
 
     Args:
-      state: that of process 0; nobody looks at those of the others.
-      blank: a state of the same network.
+      state: the state of process 0; ignored in the other processes.
+      blank: a state of the same network, for its structure and shapes.
     """
     if processes.count() == 1:
         assert state is not None
@@ -162,12 +166,12 @@ def state_of_first(state: TrainState | None, blank: TrainState) -> TrainState:
 
 
 def hash_state(state: TrainState) -> str:
-    """SHA-256 of weights and of what the optimizer remembers."""
+    """SHA-256 of the parameters and of the optimizer's state."""
     return hash_arrays(_named_leaves(state))
 
 
 def _restored(found: dict[str, np.ndarray], blank: TrainState) -> Any:
-    """Weights and optimizer's state from leaves by their paths."""
+    """The parameters and the optimizer's state from leaves by path."""
     leaves = [jnp.asarray(found[name]) for name in _named_leaves(blank)]
     return jax.tree.unflatten(jax.tree.structure((blank.params, blank.opt_state)), leaves)
 
@@ -177,14 +181,15 @@ def _read(manager: ocp.CheckpointManager, step: int) -> Any:
 
 
 def _check_hash(found: dict[str, np.ndarray]) -> None:
-    """Raise ``ValueError`` for arrays that are not those that were saved; old ones have no hash."""
+    """Raise ``ValueError`` if the arrays differ from those saved; checkpoints of old versions have no
+    hash."""
     saved = found.pop(_HASH, None)
     if saved is not None and saved.tobytes().hex() != hash_arrays(found):
         raise ValueError("hash")
 
 
-def _is_of_the_machine(error: Exception) -> bool:
-    """Whether reading failed for another reason than what is, or is not, in the files."""
+def _is_machine_error(error: Exception) -> bool:
+    """Whether reading failed because of the machine, rather than because of the contents of the files."""
     return isinstance(error, OSError) and not isinstance(error, FileNotFoundError | EOFError)
 
 
@@ -197,7 +202,7 @@ def _set_aside(checkpoint: Path, damaged: Path) -> None:
 
 
 def _snapshot(found: dict[str, np.ndarray], blank: TrainState, step: int, where: Path) -> Snapshot:
-    """A checkpoint's arrays as the records that they were made of."""
+    """Rebuild a snapshot from the arrays of a checkpoint."""
     rows: dict[str, Any] = {"measured": None, "pending": []}
     if _ROWS in found:
         rows = json.loads(found.pop(_ROWS).tobytes())

@@ -1,6 +1,6 @@
-"""Claims on folders: a folder has one process that works in it, and any other is told who that is.
+"""Claims on folders: only one process works in a folder at a time, and others are told which one it is.
 
-A claim is a lock of the operating system on a file in the folder. It ends with the process, however the
+A claim is an operating-system lock on a file in the folder. The lock ends with the process, however the
 process ends, so that nothing has to be cleaned up by hand.
 """
 
@@ -20,9 +20,9 @@ from pathlib import Path
 from envs.errors import DataError, UsageError, printable
 
 LOCK = ".lock"
-ATTEMPTS = 1000  # at holding a folder that others make and remove
-NO_ROOM = (errno.ENOSPC, errno.EDQUOT)  # of a disk that is full
-_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # of some network file systems
+ATTEMPTS = 1000  # to lock a folder while other processes create and remove it
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT)  # the disk is full
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # the file system has no locks
 _ON_EXIT: list[Callable[[], None]] = []
 
 
@@ -31,40 +31,41 @@ class InUseError(DataError):
 
 
 class Claim:
-    """A folder that this process holds."""
+    """A folder on which this process holds a claim."""
 
     def __init__(self, folder: Path, descriptor: int, made: Sequence[Path]) -> None:
         self.folder = folder
         self._descriptor = descriptor
-        self._made = made  # folders that did not exist before, the innermost first
+        self._made = made  # the parent folders that were created, innermost first
 
     def leave(self) -> None:
-        """Remove the traces of the claim: the lock, and the folders that are empty then."""
-        if _is_at(self.folder / LOCK, self._descriptor):
+        """Remove the lock file, and the folders that were created if they are empty."""
+        if _is_still_at(self.folder / LOCK, self._descriptor):
             (self.folder / LOCK).unlink(missing_ok=True)
             with suppress(OSError):
                 for folder in (self.folder, *self._made):
-                    folder.rmdir()  # only an empty folder can be removed
+                    folder.rmdir()  # fails unless the folder is empty
 
     def close(self) -> None:
-        """Let go of the folder."""
+        """Release the folder."""
         self.leave()
         os.close(self._descriptor)
 
 
 @contextmanager
 def claimed(folder: Path, wait: bool = False) -> Iterator[None]:
-    """Hold a folder, which is made if it is missing and removed afterwards if it is empty then.
+    """Claim a folder for the duration of the block.
 
-    So are folders above it that had to be made.
+    The folder and its parents are created if they are missing. Afterwards those of them that are empty are
+    removed.
 
     Args:
       folder: the folder.
-      wait: wait for another process that holds it, after a line on stderr that says so.
+      wait: whether to wait for a process that holds the folder, after a line on stderr that says so.
 
     Raises:
-      InUseError: if another process holds it.
-      UsageError: if nothing can be written there.
+      InUseError: if another process holds the folder.
+      UsageError: if the folder is not writable.
     """
     if not os.path.exists(folder):
         check_place(folder, num_bytes=0)
@@ -86,7 +87,8 @@ def claimed(folder: Path, wait: bool = False) -> Iterator[None]:
 
 
 def _try_to_hold(folder: Path, wait: bool) -> int | None:
-    """The descriptor of a lock that is held; None if another process removed the folder meanwhile."""
+    """Lock a folder; returns the file descriptor, or None if another process removed the folder
+    meanwhile."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
@@ -96,11 +98,11 @@ def _try_to_hold(folder: Path, wait: bool) -> int | None:
         return None
     except OSError as error:
         if error.errno in NO_ROOM:
-            raise  # that is no fault of the request
+            raise  # a full disk is not the user's error
         raise cannot_write(folder, error.strerror) from None
     try:
         _lock(descriptor, folder, wait)
-        if _is_at(folder / LOCK, descriptor):
+        if _is_still_at(folder / LOCK, descriptor):
             os.ftruncate(descriptor, 0)
             os.write(descriptor, f"{os.getpid()} on {socket.gethostname()}\n".encode())
             return descriptor
@@ -128,7 +130,7 @@ def _lock(descriptor: int, folder: Path, wait: bool) -> None:
             raise
 
 
-def _is_at(path: Path, descriptor: int) -> bool:
+def _is_still_at(path: Path, descriptor: int) -> bool:
     """Whether an open file is still the one at a path."""
     try:
         return os.path.samestat(os.stat(path), os.fstat(descriptor))
@@ -145,9 +147,9 @@ def check_place(path: Path, flag: str = "--out", num_bytes: int = 1 << 20) -> No
     """Raise ``UsageError`` if nothing can be written at a path that does not exist yet.
 
     Args:
-      path: a file or folder to be made.
-      flag: which flag names it, for the message.
-      num_bytes: room that must be free there.
+      path: the file or folder to be created.
+      flag: the flag that names the path, for the message.
+      num_bytes: number of bytes that must be free there.
     """
     place = path.absolute()
     try:
@@ -187,7 +189,7 @@ def cleaned_on_exit(clean: Callable[[], None]) -> Iterator[None]:
 
 
 def clean_up() -> None:
-    """Call what the blocks under way have noted (``cleaned_on_exit``), the innermost first."""
+    """Run the clean-up functions of all active ``cleaned_on_exit`` blocks, innermost first."""
     for clean in reversed(_ON_EXIT):
         with suppress(OSError):
             clean()

@@ -1,8 +1,9 @@
 """Trajectories on disk and in memory, and the batches that pre-training draws from them.
 
-On disk a dataset is a folder with ragged arrays, concatenated over time, the length of each trajectory,
-and ``manifest.json`` (what it is, how it was made, its hash). The arrays are packed in
-``trajectories.npz``, or are files of their own that are mapped into memory (``manifest``).
+On disk a dataset is a folder with ragged arrays (all trajectories concatenated over time, and their
+lengths) and ``manifest.json``, which says what the data are, how they were made, and their hash. The arrays
+are packed in ``trajectories.npz``, or each has a file of its own that is mapped into memory (see
+``manifest``).
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from mgpo_jax.manifest import (
 
 SIZES: Sizes = {"trajectory": range(1, 2**31), "step": range(1, 2**31)}
 STEP_ARRAYS = tuple(name for name in Trajectory._fields if name != "length")
-"""Those with a row for every step, of trajectories; datasets have ``rewards`` beside them."""
+"""The arrays of trajectories with a row for every step; datasets can have ``rewards`` as well."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +65,7 @@ class Dataset:
 
     @property
     def arrays(self) -> dict[str, np.ndarray]:
-        """The arrays that there are, by name."""
+        """The arrays that are not None, by name."""
         return {name: array for name, array in vars(self).items() if array is not None}
 
     def slice(self, begin: int, end: int) -> Dataset:
@@ -80,7 +81,7 @@ class Dataset:
         )
 
     def gather(self, indices: np.ndarray, lengths: np.ndarray, num_steps: int) -> Trajectory:
-        """The first ``lengths`` steps of some trajectories, padded with zeros: ``[B, num_steps, ..]``."""
+        """The first ``lengths`` [B] steps of B trajectories, padded with zeros: ``[B, num_steps, ..]``."""
         time = np.arange(num_steps)
         real = time < lengths[:, None]
         rows = np.where(real, self.starts[indices][:, None] + time, 0)
@@ -92,7 +93,7 @@ class Dataset:
         arrays = {name: padded(self.arrays[name]) for name in STEP_ARRAYS if name in self.arrays}
         for name in arrays:
             let_go(self.arrays[name])
-        length: Any = lengths.astype(np.int32)  # numpy arrays go where jax's do
+        length: Any = lengths.astype(np.int32)  # a numpy array in place of a jax array
         return Trajectory(**arrays, length=length)
 
 
@@ -105,13 +106,13 @@ def hash_task(fingerprint: np.ndarray) -> np.uint64:
 def save_dataset(
     folder: Path, dataset: Dataset, manifest: dict[str, Any], mapped: bool = False
 ) -> None:
-    """Write a dataset; the folder appears only when it is complete.
+    """Write a dataset to a new folder, which appears only when it is complete.
 
     Args:
-      folder: where to; it must not exist.
+      folder: the folder, which must not exist.
       dataset: the trajectories.
-      manifest: what else is to be known of them.
-      mapped: write a file for each array, uncompressed, which a training then maps into memory.
+      manifest: further entries of the manifest.
+      mapped: whether to write an uncompressed file for each array, which training maps into memory.
     """
     with new_folder(Path(folder)) as place:
         write_dataset(place, dataset, manifest, mapped)
@@ -139,7 +140,8 @@ def write_dataset(
 def finish_mapped(
     place: Path, names: Iterable[str], num_trajectories: int, num_steps: int, manifest: Any
 ) -> None:
-    """Write the manifest of a dataset whose arrays lie in files ``NAME.npy`` of a folder already."""
+    """Write the manifest of a mapped dataset whose arrays are already in the files ``NAME.npy`` of a
+    folder."""
     files = {name: hash_file(place / f"{name}.npy") for name in names}
     facts = {
         "format": MAPPED,
@@ -157,17 +159,17 @@ def load_dataset(
     made: Mapping[str, Any] | None = None,
     any_value: bool = False,
 ) -> tuple[Dataset, dict[str, Any]]:
-    """Read a dataset and its manifest; one whose arrays have files of their own is mapped into memory.
+    """Read a dataset and its manifest; if each array has a file of its own, it is mapped into memory.
 
     Args:
-      folder: where ``save_dataset`` wrote it.
-      spec: the world it must fit.
-      made: what must not be contradicted by the manifest, such as ``env``, ``policy``, ``seed`` and
+      folder: the folder that ``save_dataset`` wrote.
+      spec: the specification of the world that the dataset must fit.
+      made: entries that the manifest must not contradict, such as ``env``, ``policy``, ``seed`` and
         ``num_trajectories``.
-      any_value: let NaN, infinity and actions out of range pass, for those who look for them.
+      any_value: whether to accept NaN, infinity and actions out of range, for code that looks for them.
 
     Raises:
-      DataError: if it is missing, damaged, holds NaN or belongs to another world.
+      DataError: if the dataset is missing or damaged, holds NaN, or belongs to another world.
     """
     folder = Path(folder)
     mend = mend_for(folder)
@@ -199,23 +201,23 @@ def load_dataset(
 def _mapped(
     folder: Path, fields: Mapping[str, ArrayField], sizes: Sizes, manifest: Manifest, mend: str
 ) -> dict[str, np.ndarray]:
-    """The arrays of a mapped dataset, whose hashes are those of its manifest."""
+    """The arrays of a mapped dataset, after their hashes were compared with those of its manifest."""
     for name, sha256 in manifest.files.items():
         path = folder / f"{name}.npy"
         if not path.is_file() or hash_file(path) != sha256:
             raise DataError(f"{path} is missing or differs from the hash in its manifest; {mend}")
     listed = {name: f for name, f in fields.items() if f.required or name in manifest.files}
     arrays = mapped_arrays(folder, listed, sizes, mend)
-    # Arrays that every batch looks at are small, and are read.
+    # Arrays that every batch needs are small, so they are read into memory.
     for name in {"lengths", "task_hashes", "variants", "terminated", "truncated"} & arrays.keys():
         arrays[name] = np.array(arrays[name])
     return arrays
 
 
 def spec_of(facts: Facts) -> EnvSpec:
-    """The world that logs are from, as their manifest and their arrays tell it; it has no rewards.
+    """The specification of an unregistered world, derived from a dataset's manifest and arrays.
 
-    A policy that is trained on them can be loaded and can act, but there is nothing to evaluate it in.
+    It has no rewards. A policy trained on such data can be loaded and can act, but cannot be evaluated.
     """
     num = facts.num_actions
     return EnvSpec(
@@ -230,11 +232,11 @@ def spec_of(facts: Facts) -> EnvSpec:
 
 
 def variant_counts(folder: Path, sha256: str) -> dict[str, int]:
-    """How many trajectories of each variant of its world a dataset holds, by the variant's name.
+    """The number of trajectories of each variant of the world in a dataset, by the variant's name.
 
     Args:
-      folder: where the dataset was; it may be gone by now.
-      sha256: the hash of its arrays. Another dataset in that folder says nothing.
+      folder: the folder of the dataset, which may have been removed.
+      sha256: the hash of its arrays. If the folder holds another dataset by now, the result is empty.
 
     Raises:
       DataError: if the manifest is damaged.
@@ -248,7 +250,7 @@ def variant_counts(folder: Path, sha256: str) -> dict[str, int]:
 def _check_made(
     document: Mapping[str, Any], made: Mapping[str, Any], path: Path, mend: str
 ) -> None:
-    """Raise ``DataError`` for the first entry of a manifest that contradicts what is wanted."""
+    """Raise ``DataError`` for the first entry of a manifest that contradicts ``made``."""
     for name, wanted in made.items():
         found = document.get(name, wanted)
         if found != wanted and not (name == "env" and found and _same_data(found, wanted, path)):
@@ -265,7 +267,7 @@ def _same_data(first: str, second: str, where: Path) -> bool:
 
 
 def _fields(spec: EnvSpec | None) -> dict[str, ArrayField]:
-    """What the arrays of a dataset must look like, in a world or in any."""
+    """The declarations of a dataset's arrays, for a given world or for any (None)."""
     if spec is None:
         obs = ArrayField(("step", ...), "anything")
         actions = ArrayField(("step", ...), "numbers")
@@ -296,7 +298,7 @@ def _fields(spec: EnvSpec | None) -> dict[str, ArrayField]:
 
 
 def check_dataset(dataset: Dataset, where: Path | str, spec: EnvSpec | None = None) -> None:
-    """Raise ``DataError`` with the first thing that is wrong with a dataset in memory."""
+    """Raise ``DataError`` for the first fault of a dataset in memory."""
     fitted_arrays(dataset.arrays, _fields(spec), where, SIZES)
     _check_lengths(dataset, where)
 
@@ -310,8 +312,8 @@ def _check_lengths(dataset: Dataset, where: Path | str, mend: str = "") -> None:
 
 
 class BatchPlan(NamedTuple):
-    """One part of a batch (a microbatch): which trajectories, cut at which length, padded to how many
-    steps."""
+    """The plan of one part of a batch (a microbatch): indices of trajectories, the lengths that they are
+    cut to, and the number of steps that they are padded to."""
 
     indices: np.ndarray
     lengths: np.ndarray
@@ -331,18 +333,18 @@ def plan_batches(
     first_step: int = 0,
     pool_steps: int = 16,
 ) -> Iterator[list[BatchPlan]]:
-    """Batches of ``batch_size`` trajectories, in parts of nearly equal length.
+    """Plan an endless stream of batches, each in parts of trajectories of nearly equal length.
 
-    Trajectories are drawn uniformly with replacement and, with ``truncate``, cut at a uniformly
-    random step (appendix D). The draws of ``pool_steps`` batches are sorted by length, cut into
-    parts of ``part_size`` and the parts shuffled, so that little padding is computed and yet every
-    batch is a mix of all lengths. Part lengths are rounded up to multiples of ``bucket`` to bound
-    the number of shapes; parts with more than ``part_steps`` padded steps are halved until they fit,
-    so that short and long trajectories fill the same amount of cache (but not below multiples of
-    ``min_part``, the number of devices).
+    Trajectories are drawn uniformly with replacement and, with ``truncate``, cut at a uniformly random step
+    (appendix D). The draws of ``pool_steps`` batches are sorted by length and divided into parts of
+    ``part_size``, and the parts are shuffled, so that there is little padding and yet every batch is a mix
+    of all lengths. The padded lengths are rounded up to multiples of ``bucket``, to bound the number of
+    shapes. Parts with more than ``part_steps`` padded steps are halved until they fit, so that parts of
+    short and of long trajectories use the same amount of cache; their sizes remain multiples of
+    ``min_part``, the number of devices.
 
-    The stream is a function of the seed alone: starting at ``first_step`` skips exactly the batches
-    before it.
+    The stream is a function of the seed alone: starting at ``first_step`` skips exactly the batches before
+    it.
     """
     if batch_size % part_size:
         raise ValueError(f"batch_size {batch_size} is not a multiple of part_size {part_size}")

@@ -1,7 +1,7 @@
-"""Action distributions: what a policy returns and training scores, behind one interface.
+"""Action distributions, the outputs of a policy, behind one interface.
 
-A policy head puts out ``head.num_params(action_dim)`` numbers; ``head.make(params)`` turns them into
-a distribution with ``log_prob``, ``sample``, ``mode``, ``explore``, ``tempered``, ``entropy`` and ``kl``.
+An action head outputs ``head.num_params(action_dim)`` numbers; ``head.make(params)`` turns them into a
+distribution with ``log_prob``, ``sample``, ``mode``, ``explore``, ``tempered``, ``entropy`` and ``kl``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from envs.errors import NotAvailableError
 
 @runtime_checkable
 class Distribution(Protocol):
-    """A distribution over one action; leading axes of its parameters are axes of its results."""
+    """A distribution over one action; leading axes of its parameters are batch axes."""
 
     def log_prob(self, action: Array) -> Float[Array, "*batch"]: ...
 
@@ -27,8 +27,7 @@ class Distribution(Protocol):
     def mode(self) -> Array: ...
 
     def explore(self, key: PRNGKeyArray) -> Array:
-        """An action for episodes that search. It is a sample, except that a mixture leaves out the noise
-        of its components."""
+        """An exploratory action: a sample, except that a mixture omits the noise of its components."""
         ...
 
     def tempered(self, temperature: Float[Array, ""]) -> Distribution:
@@ -36,12 +35,13 @@ class Distribution(Protocol):
         ...
 
     def entropy(self) -> Float[Array, "*batch"]:
-        """Minus the mean of ``log_prob``, in nats.
+        """The entropy in nats.
 
-        Of continuous actions it is that of a density before actions are clipped, and may be negative.
+        For continuous actions it is the differential entropy before actions are clipped, which may be
+        negative.
 
         Raises:
-          NotAvailableError: where there is no closed form.
+          NotAvailableError: if there is no closed form.
         """
         ...
 
@@ -49,7 +49,7 @@ class Distribution(Protocol):
         """KL(self, other) for another distribution of the same kind, in nats.
 
         Raises:
-          NotAvailableError: where there is no closed form.
+          NotAvailableError: if there is no closed form.
         """
         ...
 
@@ -60,7 +60,7 @@ class Categorical(NamedTuple):
     logits: Float[Array, "*batch A"]
 
     def log_prob(self, action: Int[Array, "*batch"]) -> Float[Array, "*batch"]:
-        # A one-hot product instead of a gather: the gather's backward scatter is slow on CPU.
+        # A product with a one-hot instead of a gather, whose gradient is a scatter that is slow on CPUs.
         one_hot = jax.nn.one_hot(action, self.logits.shape[-1])
         return jnp.sum(jax.nn.log_softmax(self.logits) * one_hot, axis=-1)
 
@@ -88,8 +88,8 @@ class Categorical(NamedTuple):
 class Gaussian(NamedTuple):
     """Diagonal Gaussian whose actions are clipped to [-1, 1].
 
-    The log-likelihood is the paper's Eq. 2. The authors train the mean by squared error and act with a
-    fixed spread of exp(-1), which is the head ``fixed_gaussian``.
+    The log-likelihood is that of the paper's Eq. 2. The authors train the mean by squared error and act
+    with a fixed standard deviation of exp(-1), which is the head ``fixed_gaussian``.
     """
 
     mean: Float[Array, "*batch A"]
@@ -122,9 +122,9 @@ class Gaussian(NamedTuple):
 
 
 class Mixture(NamedTuple):
-    """Mixture of M diagonal Gaussians; its mode is taken to be the mean of the likeliest component.
+    """Mixture of M diagonal Gaussians; as its mode counts the mean of the most likely component.
 
-    Not from the paper, which has one Gaussian.
+    Not from the paper, which has a single Gaussian.
     """
 
     logits: Float[Array, "*batch M"]
@@ -145,11 +145,13 @@ class Mixture(NamedTuple):
         return self._component(jnp.argmax(self.logits, axis=-1)).mode()
 
     def explore(self, key: PRNGKeyArray) -> Float[Array, "*batch A"]:
-        """The mean of a random component: their spread is the demonstrator's noise, not its intention."""
+        """The mean of a random component. The noise within a component is that of the demonstrator's
+        execution, not of its intention, so it is omitted."""
         return self._component(jax.random.categorical(key, self.logits)).mode()
 
     def tempered(self, temperature: Float[Array, ""]) -> Mixture:
-        """Exact where the components do not overlap: weights and components are tempered separately."""
+        """Weights and components are tempered separately, which is exact if the components do not
+        overlap."""
         log_std = self.log_std + 0.5 * jnp.log(temperature)
         # The integral of a component's density to the power of 1 / temperature.
         volume = (1 - 1 / temperature) * self.log_std.sum(axis=-1)
@@ -171,10 +173,10 @@ class Mixture(NamedTuple):
 
 
 class Binned(NamedTuple):
-    """Every dimension of an action for itself, on N evenly spaced values from -1 to 1.
+    """Independent categorical distributions for every dimension, over N evenly spaced values from -1 to 1.
 
-    An action counts as the nearest value; samples are spread evenly around theirs and clipped. Not from
-    the paper, which has a Gaussian.
+    An action is rounded to the nearest value; samples are uniform around the drawn value and clipped. Not
+    from the paper, which has a Gaussian.
     """
 
     logits: Float[Array, "*batch A N"]
@@ -191,7 +193,7 @@ class Binned(NamedTuple):
         return jnp.clip(2 * (value + around) / (self.logits.shape[-1] - 1) - 1, -1.0, 1.0)
 
     def mode(self) -> Float[Array, "*batch A"]:
-        """The mean over the likeliest value and its two neighbors."""
+        """The mean over the most likely value and its two neighbors."""
         num_values = self.logits.shape[-1]
         likeliest = jnp.argmax(self.logits, axis=-1, keepdims=True)
         near = jnp.abs(jnp.arange(num_values) - likeliest) <= 1
@@ -221,13 +223,14 @@ class Head(NamedTuple):
 
 NUM_COMPONENTS = 5
 NUM_VALUES = 41
-MIN_LOG_STD = -3.0  # a smaller spread would let the most exact dimension drown the others
+MIN_LOG_STD = -3.0  # so that the most precise dimension does not dominate the likelihood
 MAX_LOG_STD = 1.0
 FIXED_LOG_STD = -1.0  # authors' code
 
 
 def _log_std(raw: Array) -> Array:
-    """Within bounds; near the lower one, where training goes, there is still a gradient."""
+    """The log standard deviation within its bounds; near the lower one, which training approaches, there
+    still is a gradient."""
     return jnp.minimum(MIN_LOG_STD + jax.nn.softplus(raw - MIN_LOG_STD), MAX_LOG_STD)
 
 
@@ -257,4 +260,4 @@ HEADS = {
     "mixture": Head(lambda action_dim: NUM_COMPONENTS * (1 + 2 * action_dim), _make_mixture),
     "binned": Head(lambda action_dim: NUM_VALUES * action_dim, _make_binned),
 }
-"""By name; the first is for discrete actions, the others for actions in [-1, 1]."""
+"""The heads by name; the first is for discrete actions, the others for actions in [-1, 1]."""

@@ -1,6 +1,6 @@
-"""Encoders: how the network turns an observation of any shape and dtype into a token.
+"""Encoders, which embed an observation of any shape and dtype as a token.
 
-``settings.ENCODERS`` finds them by name, with those that worlds and other packages bring.
+``settings.ENCODERS`` finds them by name, together with those of worlds and of other packages.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from envs.registry import Encoder
 
 
 class Linear(nn.Module):
-    """A linear map of all numbers of an observation (paper, appendix D). Integers count as they are.
+    """A linear map of the flattened observation (paper, appendix D). Integers are used as numbers.
 
     Attributes:
       width: size of a token.
@@ -43,13 +43,12 @@ class Linear(nn.Module):
 class Cells(nn.Module):
     """An embedding for each digit of each cell's code and for each count, and a linear map of the rest.
 
-    It is a linear layer on the observation whose codes and counts are expanded to one-hots, computed by
-    looking up rows of its kernel. Codes and counts are rounded, and those out of range count as the
-    nearest one in it.
+    This equals a linear layer on the observation with codes and counts expanded to one-hots, but is
+    computed by looking up rows of its kernel. Codes and counts are rounded and clipped to their range.
 
     Attributes:
       width: size of a token.
-      layout: what the numbers of a flat observation are.
+      layout: the meaning of the numbers in a flat observation.
     """
 
     width: int
@@ -61,7 +60,8 @@ class Cells(nn.Module):
         layout = self.layout
         num_coded = layout.num_cells + layout.num_counts
         num_rest = obs.shape[-1] - num_coded
-        # Every code and count activates one row a digit: as many inputs are not 0.
+        # The number of nonzero inputs of the equivalent linear layer (fan-in): one per digit, count and
+        # number.
         active = layout.num_cells * len(layout.code_sizes) + layout.num_counts + num_rest
         init = nn.initializers.normal(active**-0.5)
         cells = (layout.num_cells, sum(layout.code_sizes), self.width)
@@ -72,19 +72,20 @@ class Cells(nn.Module):
         token = numbers[..., num_coded:] @ kernel + bias
         codes, amounts = jnp.split(numbers[..., :num_coded], [layout.num_cells], axis=-1)
         token = _looked_up(token, self.param("cells", init, cells), digit_rows(codes, layout))
-        amounts = _whole(amounts, layout.max_count + 1)[..., None]
+        amounts = _rounded(amounts, layout.max_count + 1)[..., None]
         return _looked_up(token, self.param("counts", init, counts), amounts)
 
 
-def _whole(numbers: Float[Array, "..."], size: int) -> Int[Array, "..."]:
+def _rounded(numbers: Float[Array, "..."], size: int) -> Int[Array, "..."]:
     """The nearest integers from 0 to ``size`` - 1."""
     return jnp.clip(jnp.round(numbers), 0, size - 1).astype(jnp.int32)
 
 
 def digit_rows(codes: Float[Array, "... C"], layout: ObsLayout) -> Int[Array, "... C digits"]:
-    """Which rows of a cell's table the digits of codes look up: those of each digit follow one another."""
+    """The row of a cell's table for each digit of its code; the rows of one digit follow those of the
+    last."""
     sizes = np.array(layout.code_sizes, np.int32)
-    whole = _whole(codes, math.prod(layout.code_sizes))[..., None]
+    whole = _rounded(codes, math.prod(layout.code_sizes))[..., None]
     return whole // (np.cumprod(sizes) // sizes) % sizes + (np.cumsum(sizes) - sizes)
 
 
@@ -93,11 +94,11 @@ def _looked_up(
     tables: Float[Array, "cells rows E"],
     rows: Int[Array, "*batch cells digits"],
 ) -> Float[Array, "*batch E"]:
-    """The token plus some rows of each cell's table.
+    """The token plus the selected rows of each cell's table.
 
-    On a CPU this goes cell by cell: all rows at once would be written to memory, and their gradient
-    scattered over all tables. An accelerator is slow at scattering and fast at products
-    (``_multiplied_out``).
+    On a CPU this is done cell by cell: a single gather would write all rows to memory and scatter their
+    gradient over all tables. Accelerators are slow at scattering and fast at products, so they use
+    ``_multiplied_out``.
     """
     if jax.default_backend() != "cpu":
         return _multiplied_out(token, tables, rows)
@@ -116,13 +117,14 @@ def _multiplied_out(
     tables: Float[Array, "cells rows E"],
     rows: Int[Array, "*batch cells digits"],
 ) -> Float[Array, "*batch E"]:
-    """What ``_looked_up`` returns, as one product with one-hots, so that its gradient is a product, too."""
+    """``_looked_up`` computed as one product with one-hots, whose gradient is a product, too."""
     hot = jax.nn.one_hot(rows, tables.shape[1], dtype=tables.dtype).sum(axis=-2)
     return token + jnp.einsum("...cr,cre->...e", hot, tables)
 
 
 def layout_fault(layout: ObsLayout, shape: tuple[int, ...]) -> str | None:
-    """What is wrong with a layout of observations of a shape, as the end of a sentence; None if nothing."""
+    """What is wrong with a layout for observations of a shape, as the end of a sentence; None if nothing
+    is."""
     sizes = layout.code_sizes
     if min(layout.num_cells, layout.num_counts, layout.max_count, *sizes) < 0 or not all(sizes):
         return "must hold no negative numbers and code sizes of at least 1"
@@ -134,7 +136,7 @@ def layout_fault(layout: ObsLayout, shape: tuple[int, ...]) -> str | None:
 
 
 def _cells(obs_shape: tuple[int, ...], width: int, layout: ObsLayout | None) -> nn.Module:
-    assert layout is not None  # as ``transformer.network_config`` and ``policy_files`` see to
+    assert layout is not None  # checked by ``transformer.network_config`` and ``policy_files``
     return Cells(width, layout)
 
 

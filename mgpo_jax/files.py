@@ -1,8 +1,8 @@
-"""Files and folders that are never seen half written.
+"""Atomic writing: files and folders are never seen half written.
 
-A file is written beside its place, flushed to disk and renamed; a folder is filled under the name
-``NAME.partial`` and renamed. A process that is killed at any moment leaves either the old or the new, and
-what it was writing is removed by the next one that works there.
+A file is written under a temporary name in the same folder, flushed to disk and renamed; a folder is filled
+under the name ``NAME.partial`` and renamed. A process that is killed at any moment leaves either the old or
+the new version. Its temporary files are removed by the next process that works there.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ import numpy as np
 from envs.errors import DataError, UsageError
 from mgpo_jax.claims import LOCK, InUseError, claimed, cleaned_on_exit
 
-PLACE = "result"  # what is being written, in an unfinished folder
-TEMPORARY = ".writing-"  # how the names of files begin that are being written
+PLACE = "result"  # the folder within ``NAME.partial`` that becomes the new folder
+TEMPORARY = ".writing-"  # prefix of the names of unfinished files
 
 
 def hash_file(path: Path) -> str:
@@ -35,7 +35,7 @@ def hash_file(path: Path) -> str:
 
 
 def to_json(value: Any) -> Any:
-    """Dataclasses, paths and numpy scalars as what ``json`` can write."""
+    """Convert dataclasses, paths and numpy scalars to values that ``json`` can write."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: to_json(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, dict):
@@ -49,9 +49,9 @@ def to_json(value: Any) -> Any:
 
 @contextmanager
 def written(path: Path) -> Iterator[Path]:
-    """A place beside ``path`` to write a file to, which takes its name when all of it is on disk.
+    """A temporary path for the block to write to, which is then flushed to disk and renamed to ``path``.
 
-    It has the same suffix. If writing fails, ``path`` stays as it was.
+    It has the same suffix as ``path``. If the block fails, ``path`` is unchanged.
     """
     partial = path.with_name(f"{TEMPORARY}{secrets.token_hex(4)}{path.suffix}")
     with cleaned_on_exit(partial.unlink):
@@ -66,39 +66,40 @@ def written(path: Path) -> Iterator[Path]:
 
 
 def flush_folder(folder: Path) -> None:
-    """Bring the names in a folder to disk, so that a renamed file survives a power cut."""
+    """Flush the entries of a folder to disk, so that a renamed file survives a power failure."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
-    except OSError:  # some network file systems cannot; the data itself is on disk
+    except OSError:  # some network file systems cannot do this; the data itself is on disk
         pass
     finally:
         os.close(descriptor)
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove the files that a killed process was writing in a folder; only its owner may do so."""
+    """Remove unfinished files of killed processes from a folder; only the process that claims it may do
+    so."""
     for path in folder.glob(f"{TEMPORARY}*"):
         path.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all."""
+    """Write a text file atomically."""
     with written(path) as partial:
         partial.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file, whole or not at all.
+    """Write a JSON file atomically.
 
     Raises:
-      ValueError: for NaN or infinity, which JSON does not have.
+      ValueError: if the value holds NaN or infinity, which JSON cannot represent.
     """
     write_text(path, json.dumps(to_json(value), indent=2, allow_nan=False) + "\n")
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], compressed: bool = True) -> None:
-    """Write an npz file, whole or not at all."""
+    """Write an npz file atomically."""
     save: Any = np.savez_compressed if compressed else np.savez
     with written(path) as partial:
         save(partial, allow_pickle=False, **arrays)
@@ -106,25 +107,28 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], compressed: bool 
 
 @contextmanager
 def new_folder(folder: Path, keep: str = "", wait: bool = False) -> Iterator[Path]:
-    """A place to write to, in ``NAME.partial``, which becomes ``folder`` when all is written.
+    """A temporary folder within ``NAME.partial`` for the block to fill, which then becomes ``folder``.
 
-    ``NAME.partial`` is claimed, so that no other process writes there, and removed afterwards. What a
-    killed process left in it is removed as well, except for a folder ``keep`` in it with finished pieces of
-    work (npz files) to go on from, which stays until ``folder`` is there.
+    ``NAME.partial`` is claimed, so that no other process writes there, and is removed afterwards. Remains
+    of a killed process in it are removed first, except for the subfolder ``keep``. This one holds finished
+    pieces of work (npz files) from which to resume, and stays until ``folder`` is complete.
 
-    With ``wait``, another process that writes there is waited for.
+    Args:
+      folder: the folder to create.
+      keep: name of the subfolder of ``NAME.partial`` with finished pieces of work (default: there is none).
+      wait: whether to wait for another process that writes there.
 
     Raises:
       ExistsError: if ``folder`` exists.
       DataError: if another process writes there.
-      UsageError: if nothing can be written there.
+      UsageError: if the place is not writable.
     """
     folder = Path(folder)
     partial = partial_name(folder)
     if os.path.lexists(folder):
         raise exists_already(folder)
     with claimed(partial, wait=wait):
-        if os.path.lexists(folder):  # another process has finished it meanwhile
+        if os.path.lexists(folder):  # another process has completed it meanwhile
             raise exists_already(folder)
         _check_own(partial, keep)
         clear = functools.partial(_clear, partial, keep)
@@ -145,9 +149,9 @@ def new_folder(folder: Path, keep: str = "", wait: bool = False) -> Iterator[Pat
 
 
 def remove_leftovers(folder: Path, keep: str = "") -> None:
-    """Remove what a process left beside a finished folder, if it was killed right after making it.
+    """Remove the ``NAME.partial`` of a finished folder, left by a process killed right after completing it.
 
-    ``keep`` is that of ``new_folder``.
+    ``keep`` is the same as for ``new_folder``.
     """
     partial = partial_name(folder)
     if os.path.isdir(folder) and os.path.isdir(partial):
@@ -158,28 +162,28 @@ def remove_leftovers(folder: Path, keep: str = "") -> None:
 
 
 class ExistsError(DataError):
-    """A folder that was to be made exists."""
+    """The folder to be created exists already."""
 
 
 def exists_already(folder: Path) -> ExistsError:
-    """The error for a folder that exists."""
+    """The error for a folder that exists already."""
     return ExistsError(f"{folder} exists already; remove it or choose another place with --out")
 
 
 def partial_name(folder: Path) -> Path:
-    """Where a new folder is written."""
+    """The path ``NAME.partial`` at which a new folder is written."""
     return folder.with_name(f"{folder.name}.partial")
 
 
 def _clear(partial: Path, keep: str = "") -> None:
-    """Remove what ``new_folder`` writes in an unfinished folder, but for finished work in ``keep``."""
+    """Remove everything that ``new_folder`` writes in an unfinished folder, except for finished work."""
     shutil.rmtree(partial / PLACE, ignore_errors=True)
     if keep and not has_work(partial / keep):
         shutil.rmtree(partial / keep, ignore_errors=True)
 
 
 def _check_own(partial: Path, keep: str) -> None:
-    """Raise ``UsageError`` if an unfinished folder holds what ``new_folder`` did not write."""
+    """Raise ``UsageError`` if an unfinished folder holds anything that ``new_folder`` did not write."""
     foreign = [path for path in partial.iterdir() if path.name not in (LOCK, PLACE, keep)]
     if foreign:
         raise UsageError(
@@ -194,7 +198,7 @@ def has_work(folder: Path) -> bool:
 
 
 def hash_arrays(arrays: Mapping[str, np.ndarray]) -> str:
-    """SHA-256 of names, dtypes, shapes and contents of arrays."""
+    """SHA-256 of the names, dtypes, shapes and contents of arrays."""
     digest = hashlib.sha256()
     for name in sorted(arrays):
         array = np.asarray(arrays[name])

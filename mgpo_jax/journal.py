@@ -1,6 +1,6 @@
-"""Finished pieces of a long work on disk, so that a process that was killed can go on where it was.
+"""A journal of finished pieces of long work on disk, from which a killed process can be resumed.
 
-Where several processes work together, process 0 has the records and tells the others what it reads.
+If several processes work together, process 0 keeps the records and sends the others what it reads.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ _HASH = "sha256"
 
 
 class Journal:
-    """Records of arrays by name; each is on disk when ``write`` returns, whole or not at all.
+    """Named records of arrays on disk, which are written atomically.
 
     Args:
-      folder: where the records are, in process 0; None keeps nothing.
+      folder: the folder of the records, in process 0; None keeps no records.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
@@ -33,7 +33,7 @@ class Journal:
         """Whether records are kept; the same in all processes, each of which must make a journal."""
 
     def read(self, name: str) -> dict[str, np.ndarray] | None:
-        """The record of that name, or None if there is none that is sound."""
+        """The record of a name; None if it is missing or damaged."""
         return processes.arrays_from_first(lambda: self._read(name)) if self.keeps else None
 
     def _read(self, name: str) -> dict[str, np.ndarray] | None:
@@ -51,7 +51,7 @@ class Journal:
         return arrays
 
     def write(self, name: str, arrays: Mapping[str, np.ndarray]) -> None:
-        """Keep a record."""
+        """Write a record, which is on disk when the call returns."""
         if self.folder is not None:
             sealed = {**arrays, _HASH: np.array(hash_arrays(arrays))}
             write_arrays(self.folder / f"{name}.npz", sealed, compressed=False)

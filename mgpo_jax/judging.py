@@ -1,4 +1,4 @@
-"""Episodes of a policy under given prompts: how good they are, how sure it was, or what it did in them."""
+"""Episodes of a policy under given prompts: their returns, the policy's uncertainty, or the episodes."""
 
 from __future__ import annotations
 
@@ -36,10 +36,11 @@ def evaluate(
 ) -> tuple[np.ndarray, int]:
     """Mean returns ``[S, N]`` of queries with leaves ``[S, N, ..]``, one for each seed and task.
 
-    The second result is how many episodes a broken world ended. ``evaluate_fully`` tells more.
+    The second result is the number of episodes that ended because the simulation failed. The arguments are
+    those of ``evaluate_fully``, which returns more.
 
     Raises:
-      DataError: if the policy was made for another world, or a return is not finite.
+      DataError: if the policy was trained for another world, or a return is not finite.
     """
     judged = evaluate_fully(env, policy, tasks, queries, episodes=episodes, seed=seed)
     return np.asarray(judged.return_), int(judged.num_failed.sum())
@@ -58,28 +59,28 @@ def evaluate_fully(
 
     Args:
       env: the world.
-      policy: who acts.
+      policy: the policy that acts.
       tasks: N tasks, stacked.
       queries: with leaves ``[S, N, ..]``, one for each seed and task.
-      episodes: how many each query is judged in.
-      seed: seed of the episodes.
+      episodes: the number of episodes in which each query is judged.
+      seed: random seed of the episodes.
 
     Returns:
       Numpy arrays: ``return_`` [S, N], ``num_failed`` [S, N] and, in worlds with M named goals,
       ``achieved`` [S, N, M].
 
     Raises:
-      DataError: if the policy was made for another world, or a return is not finite.
+      DataError: if the policy was trained for another world, or a return is not finite.
     """
     run = partial(_measurement, num_episodes=episodes)
-    return _of_queries(run, env, policy, tasks, queries, seed)
+    return _run_queries(run, env, policy, tasks, queries, seed)
 
 
 class Uncertainty(NamedTuple):
-    """How sure a policy was of its actions in its own episodes."""
+    """How uncertain a policy was about its actions in its own episodes."""
 
     entropy: Float[Array, "*batch"]
-    """Of the distributions that it acted from, in nats, mean over the steps of the episode; NaN where the
+    """Entropy of the action distributions in nats, averaged over the steps of the episode; NaN if the
     policy's head has no closed form of it."""
     return_: Float[Array, "*batch"]
     num_steps: Int[Array, "*batch"]
@@ -88,32 +89,32 @@ class Uncertainty(NamedTuple):
 def uncertainty(
     env: Environment, policy: LoadedPolicy, tasks: Task, queries: Query, *, seed: int = 0
 ) -> Uncertainty:
-    """How sure a policy is of its actions under each query, in one fresh episode of it.
+    """The uncertainty of a policy about its actions under each query, in one fresh episode of each.
 
     Args:
       env: the world.
-      policy: who acts.
+      policy: the policy that acts.
       tasks: N tasks, stacked.
-      queries: with leaves ``[S, N, ..]``.
-      seed: seed of the episodes.
+      queries: with leaves ``[S, N, ..]``, one for each seed and task.
+      seed: random seed of the episodes.
 
     Returns:
       Numpy arrays [S, N].
 
     Raises:
-      DataError: if the policy was made for another world, or a return is not finite.
+      DataError: if the policy was trained for another world, or a return is not finite.
     """
-    return _of_queries(_uncertainty, env, policy, tasks, queries, seed)
+    return _run_queries(_uncertainty, env, policy, tasks, queries, seed)
 
 
 @cache
 def _uncertainty(env: Environment, network: TransformerConfig, layout: Layout) -> Any:
-    """``((lanes, queries), params) -> uncertainty``, compiled once a process."""
+    """The program ``((lanes, queries), params) -> uncertainty``, compiled once per process."""
 
     def measure(own: tuple[Lanes, Query], params: Any) -> Uncertainty:
         lane, query = own
         done = rollout(lane.key, env, transformer_policy(network, params), lane.task, query)
-        # One pass over the whole episode gives the same distributions as the steps did.
+        # One full pass over the episode gives the same distributions as its steps did.
         episode = done.trajectory
         distribution: Any = GoalTransformer(network).apply(
             params, query.prompt, episode.obs, episode.actions
@@ -128,7 +129,7 @@ def _uncertainty(env: Environment, network: TransformerConfig, layout: Layout) -
     return over_lanes(env, layout, measure)
 
 
-def _of_queries(
+def _run_queries(
     program: Callable,
     env: Environment,
     policy: LoadedPolicy,
@@ -136,10 +137,10 @@ def _of_queries(
     queries: Query,
     seed: int,
 ) -> Any:
-    """What a program finds for queries with leaves ``[S, N, ..]``, as numpy arrays with these axes.
+    """Run a program over queries with leaves ``[S, N, ..]``; returns numpy arrays with these axes.
 
-    ``program(env, network, layout)`` is a function ``((lanes, queries), params) -> found`` over all lanes;
-    what it finds has a field ``return_``.
+    ``program(env, network, layout)`` makes a function ``((lanes, queries), params) -> result`` over all
+    lanes, whose result has a field ``return_``.
     """
     check_fits(policy.config, env.spec)
     seeds, num = queries.prompt.mask.shape[:2]
@@ -167,7 +168,7 @@ def _of_queries(
 def _measurement(
     env: Environment, network: TransformerConfig, layout: Layout, num_episodes: int
 ) -> Any:
-    """``((lanes, queries), params) -> judged``, compiled once a process."""
+    """The program ``((lanes, queries), params) -> judged``, compiled once per process."""
 
     def measure(own: tuple[Lanes, Query], params: Any) -> Judged:
         lane, query = own
@@ -194,6 +195,6 @@ def _player(env: Environment, network: TransformerConfig) -> Any:
 def play(
     key: PRNGKeyArray, env: Environment, policy: LoadedPolicy, task: Task, query: Query, num: int
 ) -> Episode:
-    """``num`` episodes of a policy on one task, numpy leaves ``[num, ..]``."""
+    """Run ``num`` episodes of a policy on one task; the leaves are numpy arrays ``[num, ..]``."""
     keys = jax.random.split(key, num)
     return fetch(_player(env, policy.config)(keys, policy.params, task, query))

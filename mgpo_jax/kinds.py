@@ -1,8 +1,8 @@
-"""Kinds of pre-trained networks: the one that follows prompts, and those that other methods need.
+"""Kinds of pre-trained networks: the multi-goal policy, and the networks that other methods need.
 
-A kind says what ``experiments.pretrain --method`` trains: the network, its loss, and what a run watches. A
-policy on disk names its kind. Kinds are found as worlds are; an installed package can bring more under the
-entry-point group ``mgpo_jax.kinds``. Nothing here imports jax.
+A kind determines what ``experiments.pretrain --method`` trains: the network, its loss, and the returns that
+are monitored. A policy on disk names its kind. Kinds are found in the same way as worlds; an installed
+package can add more under the entry-point group ``mgpo_jax.kinds``. Nothing here imports jax.
 """
 
 from __future__ import annotations
@@ -22,35 +22,35 @@ MULTI_GOAL = "mgpo"
 """The kind of the paper's policy, which follows prompts."""
 
 
-def _as_it_is(config: Any, env: Any, dataset: Any) -> Any:
+def _unchanged(config: Any, env: Any, dataset: Any) -> Any:
     del env, dataset
     return config
 
 
 @dataclass(frozen=True, kw_only=True)
 class Learned:
-    """What a kind of network is made of.
+    """The functions that make up a kind of network.
 
     Attributes:
-      config: the frozen dataclass of its sizes, which derives from ``transformer.NetworkConfig``. Those
-        of its fields that are settings of a training (``PretrainConfig``) are taken from there.
-      init: ``(key, config) -> params``, random weights.
+      config: the frozen dataclass of its config, which derives from ``transformer.NetworkConfig``. Fields
+        that are also settings of pre-training (``PretrainConfig``) are taken from there.
+      init: ``(key, config) -> params``, randomly initialized parameters.
       loss: ``(params, key, config, trajectory, deterministic, obs_noise) -> (loss, stats)`` of one
         trajectory, summed over its steps; see ``training.bc_loss``.
-      complete: ``(config, env, dataset) -> config`` with what comes from the world and its data. Raises
-        ``UsageError`` in a world for which there is no such network.
-      agent: ``(config, params, judged) -> Agent`` whose returns a training watches: what the
-        network does by itself before any method has learned anything. None for the multi-goal policy,
-        which is watched under prompts.
-      facts: ``(config) -> rows`` of a released network's card, texts by their names; one is ``network``.
-      fault: ``(config) -> text``, what of a config that was read does not fit together, after types and
-        ranges were found right; None if nothing.
+      complete: ``(config, env, dataset) -> config``, completed with what comes from the world and its data.
+        Raises ``UsageError`` if there is no such network for the world.
+      agent: ``(config, params, judged) -> Agent`` whose returns are monitored during training: the network
+        acting by itself, before any method has adapted it. None for the multi-goal policy, which is
+        monitored under prompts.
+      facts: ``(config) -> rows`` of a released network's model card, texts by name; one is ``network``.
+      fault: ``(config) -> text``, what is wrong with a config that was read from disk, beyond types and
+        ranges; None if nothing is.
     """
 
     config: type[NetworkConfig]
     init: Callable[[Any, Any], Any]
     loss: Callable[..., Any]
-    complete: Callable[[Any, Any, Any], Any] = _as_it_is
+    complete: Callable[[Any, Any, Any], Any] = _unchanged
     agent: Callable[[Any, Any, Any], Agent] | None = None
     facts: Callable[[Any], Mapping[str, str]] = lambda config: {"network": "of its own kind"}
     fault: Callable[[Any], str | None] = lambda config: None
@@ -61,13 +61,13 @@ class Kind:
     """A kind of pre-trained network.
 
     Attributes:
-      name: what ``pretrain --method`` calls it, and the folder of its released weights in that of the
-        world's policy.
-      learned: what it is made of, or its place as ``module:attribute``.
-      title: its name in the title of a card.
-      watched: whose returns a training watches, in words.
-      preset: what it changes in the settings of the world's presets, by the names of the settings.
-      summary: what it is, in one line.
+      name: its name, as given to ``pretrain --method``; also the name of the subfolder of a world's
+        released policy that holds its weights.
+      learned: the functions that make it up, or their place as ``module:attribute``.
+      title: its name in the title of a model card.
+      watched: a description of the agent whose returns are monitored during training.
+      preset: settings in which it differs from the world's presets, by name.
+      summary: a one-line description.
     """
 
     name: str
@@ -78,7 +78,7 @@ class Kind:
     summary: str = ""
 
     def load(self) -> Learned:
-        """What it is made of."""
+        """Import the functions that make up the kind."""
         if not isinstance(self.learned, str):
             return self.learned
         module, _, attribute = self.learned.partition(":")

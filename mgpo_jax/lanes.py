@@ -1,9 +1,10 @@
-"""Lanes: how many episodes and adaptations run in one compiled program, on all devices at once.
+"""Lanes: many episodes and adaptations in one compiled program, on all devices at once.
 
-Every task, seed and variant of a method is a *lane* of one compiled program. Lanes are spread over the
-devices of all processes that work together and, on each, run in *groups*: the lanes of a group share one
-clock, so that a group's episode ends with its slowest lane. On a CPU a group is as large as the memories of
-its agents fit into the cache near a core, or as large as a step of the world needs to be worth its call.
+Every combination of a task, a seed and a variant of a method is a *lane* of one compiled program. Lanes are
+spread over the devices of all processes that work together. On each device they run in *groups*: the lanes
+of a group step together, so that a group's episode takes as long as its longest lane. A group on a CPU is
+as large as the cache of a core allows, given the memories (key-value caches) of its agents, and at least as
+large as the world needs to make the call into its engine worthwhile (``Engine.worlds_together``).
 """
 
 from __future__ import annotations
@@ -22,40 +23,41 @@ from envs.base import Environment, Task
 from mgpo_jax.sharding import mesh_of_all, on_devices
 from mgpo_jax.transformer import TransformerConfig
 
-# Bytes of the agents' memories (key-value caches) in a group: what fits into the cache of a CPU's core, or
-# into the memory of an accelerator.
+# Largest total size of the agents' memories (key-value caches) in a group, in bytes: what fits into the
+# cache of a CPU core, or into the memory of an accelerator.
 GROUP_BYTES, GROUP_BYTES_ACCELERATOR = 3 << 20, 4 << 30
 
 
 def together(env: Environment, function: Callable, in_axes: Any = 0) -> Any:
-    """A compiled ``function`` over many episodes, which share one clock on one device."""
+    """A jitted ``function`` mapped over many episodes, which step together on one device."""
     options = dict(env.engine.compiler_options)
     return jax.jit(jax.vmap(function, in_axes=in_axes), compiler_options=options)
 
 
 class Lanes(NamedTuple):
-    """What each lane has of its own."""
+    """The inputs that differ between lanes; every array has a leading axis of lanes."""
 
     task: Task
     key: PRNGKeyArray
     numbers: dict[str, Array]
-    """Hyper-parameters that are data."""
+    """Numeric hyper-parameters by name, which are traced."""
     stopped: Bool[Array, "*lanes"] | None = None
-    """Whether the search has ended; None where none ends early."""
+    """Whether the search of a lane has ended; None if no search can end early."""
 
 
 class Layout(NamedTuple):
-    """How lanes are spread: over devices, and on each in groups that share a clock."""
+    """How lanes are spread over devices and, on each device, divided into groups that step together."""
 
     mesh: Mesh
     group: int
+    """Number of lanes in a group."""
     num_lanes: int
-    """With those that only fill up the last groups."""
+    """Number of lanes, including those that only pad the last groups."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """How lanes are numbered: variants, then seeds, then tasks."""
+    """The numbering of lanes: by variant, then seed, then task (row-major)."""
 
     variants: int
     seeds: int
@@ -73,9 +75,14 @@ class Grid:
         numbers: dict[str, list[int | float]],
         ends_early: bool = False,
     ) -> Lanes:
-        """The lanes; those beyond the last variant repeat the first ones to fill up a group.
+        """The inputs of all lanes; the lanes that pad the last group repeat the first ones.
 
-        With ``ends_early`` each says whether it has stopped.
+        Args:
+          layout: how the lanes are spread.
+          tasks: N tasks, stacked.
+          seed: random seed of the run; lanes of the same task and seed number share their key.
+          numbers: numeric hyper-parameters by name, a value for each variant.
+          ends_early: whether searches can end early (``Lanes.stopped``).
         """
         index = np.arange(layout.num_lanes)
         runs = self.seeds * self.tasks
@@ -88,18 +95,18 @@ class Grid:
         )
 
     def shape(self, rows: np.ndarray) -> np.ndarray:
-        """Rows of lanes as ``[variants, S, N, ..]``, without the lanes that only fill up groups."""
+        """Reshape rows of lanes to ``[variants, S, N, ..]``, without the lanes that only pad groups."""
         return rows[: self.size].reshape(self.variants, self.seeds, self.tasks, *rows.shape[1:])
 
 
 def lanes_together(env: Environment, memory_bytes: int) -> int:
-    """How many lanes share a clock."""
+    """The largest number of lanes in a group, given the bytes of one agent's memory."""
     limit = GROUP_BYTES if jax.default_backend() == "cpu" else GROUP_BYTES_ACCELERATOR
     return max(env.engine.worlds_together, limit // max(memory_bytes, 1), 1)
 
 
 def lay_out(env: Environment, num_lanes: int, memory_bytes: int) -> Layout:
-    """Spread at least ``num_lanes`` lanes evenly."""
+    """Spread lanes evenly over all devices and groups, with padding where they do not divide evenly."""
     mesh = mesh_of_all()
     on_each = -(-num_lanes // mesh.devices.size)
     num_groups = -(-on_each // lanes_together(env, memory_bytes))
@@ -108,7 +115,10 @@ def lay_out(env: Environment, num_lanes: int, memory_bytes: int) -> Layout:
 
 
 def over_lanes(env: Environment, layout: Layout, function: Callable) -> Any:
-    """A jitted ``function(own, shared)`` over all lanes."""
+    """A jitted ``function(own, shared)`` mapped over all lanes.
+
+    ``own`` is a pytree with a leading axis of lanes, ``shared`` is the same for all of them.
+    """
 
     def on_device(own: Any, shared: Any) -> Any:
         grouped = jax.tree.map(lambda leaf: leaf.reshape(-1, layout.group, *leaf.shape[1:]), own)
@@ -120,6 +130,6 @@ def over_lanes(env: Environment, layout: Layout, function: Callable) -> Any:
 
 
 def cache_bytes(network: TransformerConfig) -> int:
-    """Bytes of the key-value cache of an episode."""
+    """Bytes of the float32 key-value cache of a full-length episode."""
     num_tokens = network.max_prompt_length + network.num_step_tokens(network.horizon)
     return 4 * 2 * network.num_layers * network.embed_dim * num_tokens

@@ -1,8 +1,8 @@
-"""The ``manifest.json`` of a dataset, and what is known of one before its steps are read. Imports no jax.
+"""The ``manifest.json`` of a dataset, and the facts about a dataset before it is read. Imports no jax.
 
-A dataset lies on disk in one of two forms. What a demonstrator collected is ``trajectories.npz``,
-compressed. What was imported is a file ``NAME.npy`` for each array, uncompressed, which is mapped into
-memory instead of read: such a dataset may be larger than the memory.
+There are two formats on disk. Data collected from a demonstrator are packed in ``trajectories.npz``,
+compressed. Imported data have an uncompressed file ``NAME.npy`` for each array, which is mapped into memory
+instead of read, so that such a dataset may be larger than the memory.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ from mgpo_jax.schema import (
 from mgpo_jax.settings import Count, Index, Seed
 
 PACKED, MAPPED = 2, 3
-"""The formats that are written. 1 had neither rewards nor last observations, and called achieved goals
-"goals"."""
+"""The current format versions. Version 1 had neither rewards nor last observations, and called achieved
+goals "goals"."""
 FORMATS = (1, PACKED, MAPPED)
 ARRAYS = "trajectories.npz"
 MANIFEST = "manifest.json"
@@ -49,7 +49,8 @@ Bound = Annotated[float, Ge(-1e18), Le(1e18)]
 
 
 class SpecEntry(BaseModel):
-    """What a manifest says of the world that the logs are from, where no world is registered for it."""
+    """The manifest's description of the world that logged data are from, if that world is not
+    registered."""
 
     model_config = STRICT
 
@@ -57,17 +58,17 @@ class SpecEntry(BaseModel):
     horizon: Size
     """Number of steps after which an episode is cut off."""
     num_actions: Size | None = None
-    """Number of discrete actions; null where they are continuous."""
+    """Number of discrete actions; null if actions are continuous."""
     truncate_in_hindsight: bool = True
-    """Whether a trajectory that is cut at any step shows how to reach another goal."""
+    """Whether a trajectory cut at any step demonstrates how to reach another goal."""
     action_low: Annotated[list[Bound], MaxLen(10_000)] = []
-    """What -1 stands for in each component of an action; empty where actions are as they were."""
+    """The original value of -1 in each component of an action; empty if actions were not rescaled."""
     action_high: Annotated[list[Bound], MaxLen(10_000)] = []
-    """What 1 stands for, likewise."""
+    """The original value of 1 in each component; empty if actions were not rescaled."""
 
 
 class Manifest(BaseModel):
-    """What is known of the entries of ``manifest.json``; there may be others."""
+    """The known entries of ``manifest.json``; further ones are allowed."""
 
     model_config = {**STRICT, "extra": "ignore"}
 
@@ -75,9 +76,9 @@ class Manifest(BaseModel):
     sha256: Sha256
     num_trajectories: Count = 0
     num_steps: Count = 0
-    """0 where the manifest does not say."""
+    """Number of steps of all trajectories; 0 if the manifest does not say."""
     files: Annotated[dict[Name, Sha256], MaxLen(32)] = {}
-    """The hash of each array's file, by the name of the array; only of mapped datasets."""
+    """The hash of each array's file, by the name of the array; only in mapped datasets."""
     spec: SpecEntry | None = None
     env: Name | None = None
     policy: DemonstratorName | None = None
@@ -91,20 +92,21 @@ class Manifest(BaseModel):
     at_horizon: Annotated[float, Ge(0), Le(1)] = 0
     hindsight_return: dict[str, Json] = {}
     variants: dict[str, Index] = {}
-    """How many trajectories each variant of the world has, by its name, in the order of their indices."""
+    """Number of trajectories of each variant of the world, by name, in the order of the variants'
+    indices."""
 
 
 def mend_for(folder: Path) -> str:
-    """What mends a damaged dataset, the end of a message."""
+    """How to mend a damaged dataset, the end of a message."""
     mapped = (Path(folder) / "actions.npy").exists()
     return f"remove {folder} and {'import' if mapped else 'collect'} it again"
 
 
 def read_manifest(folder: Path, mend: str = "") -> tuple[dict[str, Any], Manifest]:
-    """The manifest of a dataset, as it is and as far as it is known.
+    """The manifest of a dataset, as the whole document and as the record of its known entries.
 
     Raises:
-      DataError: if there is none, or it is damaged or of another format.
+      DataError: if the manifest is missing, damaged or of another format.
     """
     path, mend = Path(folder) / MANIFEST, mend or mend_for(folder)
     if not path.is_file():
@@ -129,20 +131,20 @@ def hash_of_files(files: Mapping[str, str]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Facts:
-    """What a training has to know of a dataset before it reads it.
+    """Facts about a dataset that training needs before it reads the data.
 
     Attributes:
-      folder: where it lies.
-      num_trajectories: N.
-      num_steps: of all trajectories.
-      longest: number of steps of the longest one.
-      obs_shape: of an observation.
-      obs_dtype: of an observation.
+      folder: the folder of the dataset.
+      num_trajectories: N, the number of trajectories.
+      num_steps: number of steps of all trajectories.
+      longest: number of steps of the longest trajectory.
+      obs_shape: shape of an observation.
+      obs_dtype: dtype of an observation.
       goal_dim: size G of a goal.
-      num_actions: number of discrete actions, or None.
+      num_actions: number of discrete actions; None if actions are continuous.
       action_dim: ``num_actions``, or the size A of a continuous action.
-      spec: what the manifest says of the world; where it says nothing, what the arrays show.
-      env: the world that it was collected in, if any.
+      spec: the manifest's description of the world; if there is none, one derived from the arrays.
+      env: the world that the data were collected in, if any.
     """
 
     folder: Path
@@ -169,10 +171,10 @@ class Facts:
 
 
 def read_facts(folder: Path) -> Facts:
-    """What is known of a dataset without reading its observations.
+    """The facts about a dataset, without reading its observations.
 
     Raises:
-      DataError: if there is none, or it is damaged as far as it is looked at.
+      DataError: if the dataset is missing, or the files that are read are damaged.
     """
     folder = Path(folder)
     mend = mend_for(folder)

@@ -1,6 +1,6 @@
-"""The methods that adapt to a task, by name, with their hyper-parameters. Nothing here imports jax.
+"""The registry of adaptation methods and their hyper-parameters. Nothing here imports jax.
 
-A method is found under a name that it was registered with, under the name of an entry point in the group
+A method is found by the name it was registered under, by the name of an entry point in the group
 ``mgpo_jax.methods``, or as ``module:attribute``.
 """
 
@@ -33,13 +33,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Setting:
-    """What a method may know before it sees a task. Everything in it is static.
+    """Everything that a method may know before it sees a task. All of it is static.
 
     Attributes:
       env: the world.
-      network: the sizes of the network that the method starts from.
-      num_episodes: the budget of episodes for one task.
-      judged: how the world judges policies.
+      network: the config of the network that the method starts from.
+      num_episodes: the budget for one task, in episodes.
+      judged: how the best choice is judged.
     """
 
     env: Environment
@@ -50,26 +50,25 @@ class Setting:
 
 @dataclass(frozen=True)
 class NoHyper:
-    """The hyper-parameters of a method that has none."""
+    """The empty hyper-parameters of methods that have none."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Method:
-    """Everything that generic code needs to know of a method.
+    """Everything that generic code needs to know about a method.
 
     Attributes:
-      name: what ``--method`` calls it.
-      make: ``(setting, params, hyper) -> Adapter``, or its place as ``module:attribute``. It is called
-        while a program is traced: the weights ``params`` and the numbers in ``hyper`` are data, so
-        another policy of the same sizes, or a sweep over a hyper-parameter, compiles nothing.
-      hyper: the frozen dataclass of its hyper-parameters; flags, help and checks are made from it.
-      check: ``(setting, hyper) -> None``, or its place, raises ``UsageError`` where the method cannot be
-        used.
+      name: its name, as given to ``--method``.
+      make: ``(setting, params, hyper) -> Adapter``, or the place of this function as ``module:attribute``.
+        It is called under tracing: the parameters ``params`` and the numbers in ``hyper`` are traced, so
+        another policy of the same sizes, or a sweep over a hyper-parameter, needs no recompilation.
+      hyper: the frozen dataclass of its hyper-parameters, from which flags, help and checks are made.
+      check: ``(setting, hyper) -> None``, or its place; raises ``UsageError`` if the method cannot be used.
       policy: the kind of network that it starts from (``kinds.KINDS``).
-      learns: whether what it does can change from one episode to the next. If not, one episode of it is
-        worth as much as a whole budget.
+      learns: whether its behavior can change from one episode to the next. If not, one episode tells as
+        much as a whole budget.
       title: its name in legends [the name].
-      summary: what it is, in one line.
+      summary: a one-line description.
     """
 
     name: str
@@ -86,7 +85,7 @@ class Method:
         return load(self.make)(setting, params, hyper)
 
     def check_use(self, setting: Setting, hyper: Any) -> None:
-        """Raise ``UsageError`` for hyper-parameters out of bounds or a setting that does not fit."""
+        """Raise ``UsageError`` if a hyper-parameter is out of bounds or the method cannot be used here."""
         if not isinstance(hyper, self.hyper):
             raise UsageError(
                 f"{self.name} takes hyper-parameters as {self.hyper.__name__}, found "
@@ -98,19 +97,19 @@ class Method:
             load(self.check)(setting, hyper)
 
     def hyper_in(self, world: World | None, values: Mapping[str, Any] | None = None) -> Any:
-        """The hyper-parameters in a world, which may have defaults of its own, with some values changed.
+        """The hyper-parameters with the world's own defaults, if it has any, and then ``values`` applied.
 
         Raises:
-          UsageError: for a name that is none of this method's, with the methods that have it.
+          UsageError: if the method has no hyper-parameter of a given name; names the methods that do.
         """
         own = {} if world is None else world.method_defaults.get(self.name, {})
         return self.hyper_from({**own, **(values or {})})
 
     def hyper_from(self, values: Mapping[str, Any]) -> Any:
-        """The hyper-parameters with some values changed.
+        """The default hyper-parameters with ``values`` applied.
 
         Raises:
-          UsageError: for a name that is none of this method's, with the methods that have it.
+          UsageError: if the method has no hyper-parameter of a given name; names the methods that do.
         """
         own = {field.name for field in dataclasses.fields(self.hyper)}
         for name in values:
@@ -120,7 +119,7 @@ class Method:
 
 
 def check_kind(found: str, method: Method) -> None:
-    """Raise ``UsageError`` for a policy of another kind than a method starts from."""
+    """Raise ``UsageError`` if a method starts from another kind of network than ``found``."""
     if found != method.policy:
         raise UsageError(
             f"{method.name} starts from a network of the kind {method.policy}, this one is of the kind "
@@ -129,7 +128,7 @@ def check_kind(found: str, method: Method) -> None:
 
 
 def load(place: str | Callable) -> Callable:
-    """What ``module:attribute`` names; anything else as it is."""
+    """Import the function at ``module:attribute``; a function is returned unchanged."""
     if not isinstance(place, str):
         return place
     module, _, attribute = place.partition(":")
@@ -149,10 +148,13 @@ def foreign_setting(name: str, method: Method) -> UsageError:
 
 
 def split_hyper(hypers: Sequence[Any]) -> tuple[Any, dict[str, list[int | float]]]:
-    """Hyper-parameters of several variants as one static record and the numbers that are data.
+    """Split the hyper-parameters of several variants into a static record and traced numbers.
+
+    Returns:
+      A record with the shared static settings, and the numeric ones by name, a value for each variant.
 
     Raises:
-      UsageError: if the variants differ in a setting that decides about shapes.
+      UsageError: if the variants differ in a static setting, which determines shapes.
     """
     first = hypers[0]
     numbers: dict[str, list[int | float]] = {}
@@ -167,10 +169,10 @@ def split_hyper(hypers: Sequence[Any]) -> tuple[Any, dict[str, list[int | float]
 
 
 def with_numbers(hyper: Any, numbers: Mapping[str, Any]) -> Any:
-    """A copy of some hyper-parameters with other numbers, which may be traced arrays."""
+    """A copy of hyper-parameters with the given numbers, which may be traced arrays."""
     changed = copy.copy(hyper)
     for name, value in numbers.items():
-        object.__setattr__(changed, name, value)  # the record is frozen and its types are floats
+        object.__setattr__(changed, name, value)  # the dataclass is frozen
     return changed
 
 
@@ -179,7 +181,7 @@ class PromptHyper:
     """Hyper-parameters of every method that searches prompts. Values in brackets are the paper's."""
 
     max_goals: NumGoals | None = None
-    """K, the longest prompt to try (default: the longest that the policy was trained with) [5]."""
+    """K, the number of goals of the longest prompt to try (default: the policy's longest) [5]."""
 
 
 @dataclass(frozen=True)
@@ -187,8 +189,8 @@ class ExploreHyper(PromptHyper):
     """Hyper-parameters of Algorithm 1 without a bandit."""
 
     keep_rewarded: bool = True
-    """In worlds that reward a sequence part by part, new prompts keep the goals of the best trajectory
-    that were rewarded, and put those after them in a random order [False]."""
+    """Whether new prompts keep the rewarded goals of the best trajectory and shuffle the goals after them,
+    in worlds that reward a sequence part by part [False]."""
 
 
 @dataclass(frozen=True)
@@ -198,7 +200,7 @@ class UcbHyper(ExploreHyper):
     c: NotNegative = 1.0
     """Exploration constant [1]."""
     scale: Positive | None = None
-    """Unit of returns in which c counts; 1 is Eq. 3 as printed (default: the span of the world's
+    """Unit of returns in which c is measured; 1 is Eq. 3 as printed (default: the span of the world's
     returns)."""
 
 
@@ -207,7 +209,7 @@ class BpeHyper(ExploreHyper):
     """Hyper-parameters of Algorithm 1 with Bayesian posterior estimation (Eq. 4)."""
 
     min_std: Annotated[float, Gt(0), Le(1)] = 0.02
-    """Smallest spread of a prompt's returns, as a share of the prior's."""
+    """Smallest standard deviation of a prompt's returns, as a fraction of the prior's."""
 
 
 @dataclass(frozen=True)
@@ -215,7 +217,7 @@ class GripsHyper(PromptHyper):
     """Hyper-parameters of Algorithm 2."""
 
     num_edits: Annotated[int, Ge(1), Le(4_096)] = 5
-    """Edited prompts in an iteration [5]."""
+    """Number of edited prompts in an iteration [5]."""
 
 
 @dataclass(frozen=True)
@@ -223,9 +225,9 @@ class BbtHyper(PromptHyper):
     """Hyper-parameters of Algorithm 3."""
 
     population_size: Annotated[int, Ge(2), Le(4_096)] = static(10)
-    """Population of CMA-ES [10]."""
+    """Population size of CMA-ES [10]."""
     latent_dim: Annotated[int, Ge(1), Le(4_096)] = static(5)
-    """Size of z."""
+    """Dimension of the latent z."""
     std_init: Annotated[float, Gt(0), Le(1_000)] = 0.5
     """Initial step size, in units of goals."""
 
@@ -235,15 +237,16 @@ class PlanHyper(PromptHyper):
     """Hyper-parameters of planning in a model of the task (not in the paper)."""
 
     rehearse: Annotated[int, Ge(0), Le(100)] = static(3)
-    """Rounds of changed prompts that are rehearsed in a search at most; 0 rehearses nothing."""
+    """Largest number of rounds of mutated prompts that a search rehearses; 0 disables rehearsals."""
     steer: Annotated[int, Ge(0), Le(1_000)] = static(20)
-    """Gradient steps by which a search moves goals of prompts towards the planned way; 0 is none."""
+    """Largest number of gradient steps that move a prompt's goals towards the planned path; 0 disables
+    them."""
     splice: bool = True
-    """Plan in what all episodes have seen; without it in what the best one has."""
+    """Whether to plan on a map of all episodes, rather than of the best one alone."""
     frontier: bool = True
-    """Explore towards states from where the task goal may be near, too."""
+    """Whether to explore also towards frontiers, states from which the task goal may be near."""
     num_states: Annotated[int, Ge(1), Le(100_000)] = static(512)
-    """Room for states in the map of the task."""
+    """Capacity of the map of the task, in states."""
 
 
 _HERE = "mgpo_jax.optimizers.methods"
@@ -325,12 +328,12 @@ GCBC = Method(
 
 
 def policy_kind(name: str) -> str:
-    """The kind of network that a method starts from; of a method that is not known, one for prompts."""
+    """The kind of network that a method starts from; for an unknown name, the multi-goal policy."""
     return METHODS.find(name).policy if name in METHODS.names() else MULTI_GOAL
 
 
 def register(method: Method) -> Method:
-    """Make a method known under its name; returns it."""
+    """Register a method under its name; returns the method."""
     return METHODS.register(method)
 
 
@@ -343,6 +346,6 @@ def find(name: str) -> Method:
     """The record of a method, by its name or as ``module:attribute``.
 
     Raises:
-      UsageError: with the nearest name, for one that does not exist.
+      UsageError: if there is no such method; suggests the nearest name.
     """
     return METHODS.find(name)

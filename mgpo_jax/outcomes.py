@@ -1,4 +1,4 @@
-"""What adaptations leave behind: results for users, and the records of lanes that they are made of."""
+"""The results of adaptations: outcomes for users, and the records of lanes from which they are made."""
 
 from __future__ import annotations
 
@@ -17,54 +17,55 @@ from mgpo_jax.lanes import Grid
 
 
 class Reached(NamedTuple):
-    """The goals that episodes reached, of all episodes one after another."""
+    """The goals that episodes reached, concatenated over all episodes."""
 
     counts: np.ndarray
-    """``[S, N, E]``: how many goals each episode reached."""
+    """``[S, N, E]``: number of goals that each episode reached."""
     steps: np.ndarray
-    """``[total]``: in which step each was reached, counted from 0."""
+    """``[total]``: the step in which each goal was reached, counted from 0."""
     goals: np.ndarray
-    """``[total, G]``."""
+    """``[total, G]``: the goals."""
 
 
 class Outcome(NamedTuple):
-    """Raw results of one method, axes S seeds, N tasks, E episodes, R rounds, C judgements."""
+    """Raw results of one method, with axes of S seeds, N tasks, E episodes, R rounds and C judgements."""
 
     returns: np.ndarray
-    """``[S, N, E]`` returns of the search's episodes."""
+    """``[S, N, E]``: returns of the search's episodes."""
     failed: np.ndarray
-    """``[S, N, E]``: whether the world broke down."""
+    """``[S, N, E]``: whether an episode ended because the simulation failed."""
     choices: Any
-    """Who acted, leaves ``[S, N, R, ..]``."""
+    """The choice of each round (such as a prompt), leaves ``[S, N, R, ..]``."""
     best: Any
     """The best choice after each round, leaves ``[S, N, R, ..]``."""
     lengths: np.ndarray
-    """``[S, N, E]``: steps of the episodes."""
+    """``[S, N, E]``: number of steps of the episodes."""
     keys: np.ndarray
     """``[S, N, E, 2]``: raw random keys of the episodes."""
     actions: np.ndarray | None
     """``[S, N, E, T]`` small integers (``adaptation.small_actions``); None if they were not kept."""
     reached: Reached
     eval_episodes: np.ndarray
-    """``[C]``: after how many episodes the best choice was judged."""
+    """``[C]``: number of episodes after which the best choice was judged."""
     eval_returns: np.ndarray
-    """``[S, N, C]``: mean return of the judging episodes. The first is that of the initial choice."""
+    """``[S, N, C]``: mean return of the judging episodes. The first judgement is that of the initial
+    choice."""
     num_episodes: int
-    """All episodes that were run: those of the search and those that judged."""
+    """Number of all episodes that were run, including those that judged."""
     num_failed: int
-    """Those that the world ended because it broke down."""
+    """Number of episodes that ended because the simulation failed."""
     cpu_seconds: float
-    """CPU time of all of them, without compilation."""
+    """CPU time of all episodes in seconds, without compilation."""
     eval_achieved: np.ndarray | None = None
-    """``[S, N, C, M]``: share of the judging episodes that achieved each of the world's M named goals; None
-    in worlds without any (``Environment.goal_names``)."""
+    """``[S, N, C, M]``: fraction of the judging episodes that achieved each of the world's M named goals;
+    None in worlds without named goals (``Environment.goal_names``)."""
     num_scored: np.ndarray | None = None
-    """``[S, N, R]``: prompts scored without an episode until the end of each round; None for methods that
-    learn by episodes alone."""
+    """``[S, N, R]``: cumulative number of prompts scored without an episode at the end of each round; None
+    for methods that learn from episodes alone."""
 
 
 class Segment(NamedTuple):
-    """What a finished segment leaves behind, rows of lanes."""
+    """The results of a finished segment; all arrays have a leading axis of lanes."""
 
     log: AdaptLog
     judged: Judged
@@ -72,12 +73,15 @@ class Segment(NamedTuple):
 
 
 class Record(NamedTuple):
-    """What an adaptation left behind, rows of lanes; the log is without the goals that were reached."""
+    """The results of all segments of an adaptation; all arrays have a leading axis of lanes.
+
+    The log is without the goals that were reached, which are in ``reached``.
+    """
 
     log: AdaptLog
     judged: Judged
     reached: list[Goals]
-    """The goals of each segment's episodes, ``[lanes, R, K, T, ..]``."""
+    """The goals of the episodes of each segment, ``[lanes, R, K, T, ..]``."""
 
     def outcome(
         self, variant: int, grid: Grid, after: np.ndarray, num_episodes: int, cpu_seconds: float
@@ -113,12 +117,12 @@ class Record(NamedTuple):
 
 
 def _by_judgement(achieved: np.ndarray | None) -> np.ndarray | None:
-    """Shares [S, N, M, C] as [S, N, C, M]."""
+    """Move the axis of judgements: fractions [S, N, M, C] as [S, N, C, M]."""
     return None if achieved is None else np.moveaxis(achieved, -1, -2)
 
 
 def without_goals(log: AdaptLog) -> AdaptLog:
-    """The log without the goals that were reached, which take most of its memory."""
+    """The log without the goals that were reached, which take up most of its memory."""
     nothing: Any = None
     return log._replace(played=log.played._replace(goals=nothing))
 

@@ -1,4 +1,4 @@
-"""What a rollout needs of a policy, and how the Transformer provides it."""
+"""The interface that a rollout needs from a policy, and the Transformer behind it."""
 
 from __future__ import annotations
 
@@ -18,44 +18,50 @@ from mgpo_jax.transformer import (
 
 
 class Policy(NamedTuple):
-    """Acts step by step from a prompt; the functions are for one episode and are pure."""
+    """A prompted policy that acts step by step, as pure functions for one episode."""
 
     prefill: Callable
     """``(prompt, obs) -> (action distribution, carry)`` at the first observation."""
     decode: Callable
-    """``(carry, action, obs) -> (action distribution, carry)`` after every step."""
+    """``(carry, action, obs) -> (action distribution, carry)``: called after every step with the last
+    action and the new observation."""
     grow: Callable
     """``(carry, num_steps) -> carry`` with room for that many more decodes."""
     num_slots: int
-    """P, the number of slots of the prompts that it takes: its longest prompt."""
+    """P, the number of slots of a prompt, and so the length of the longest prompt."""
     score: Callable | None = None
-    """``(prompt, obs [T, ..], actions [T, ..]) -> action distributions [T]`` of an episode that took these
-    actions, all at once. Prompt optimizers that ask the policy for likelihoods need it."""
+    """``(prompt, obs [T, ..], actions [T, ..]) -> action distributions [T]``: teacher forcing, all steps of
+    a recorded episode in one pass. Needed by prompt optimizers that use likelihoods of the policy."""
 
 
 class LoadedPolicy(NamedTuple):
-    """A network, its weights and how it was made."""
+    """A trained network with its parameters and its provenance."""
 
     config: Any
-    """The network's sizes, a ``transformer.NetworkConfig``; of the policy that follows prompts a
-    ``TransformerConfig``."""
+    """The network's config, a ``transformer.NetworkConfig``; a ``TransformerConfig`` for multi-goal
+    policies."""
     params: Any
+    """The network's parameters, a Flax pytree."""
     made: dict[str, Any]
+    """How the policy was trained, by the names of ``policy.json``."""
     sha256: str = ""
-    """Of the file of weights; empty for weights that were never on disk."""
+    """Digest of the parameter file; empty for parameters that were never on disk."""
     folder: Path | None = None
-    """Where it was read."""
+    """The folder that it was read from."""
     seen_goals: SeenGoals | None = None
-    """The goals it was trained on; None for a policy that did not keep them."""
+    """The goals that it was trained on; None if they were not kept."""
 
     @property
     def policy(self) -> Policy:
-        """The network as functions that act."""
+        """The network and its parameters as a policy for rollouts."""
         return transformer_policy(self.config, self.params)
 
 
 def check_fits(config: NetworkConfig, spec: EnvSpec, who: str = "the policy") -> None:
-    """Raise ``DataError`` if a network was made for another world than that of ``spec``."""
+    """Raise ``DataError`` if a network was trained for another world than that of ``spec``.
+
+    ``who`` names the network in the message.
+    """
     facts = {
         "discrete actions": (config.head == "categorical", spec.discrete),
         "obs_shape": (config.obs_shape, spec.obs.shape),

@@ -1,8 +1,8 @@
-"""Policies on disk: one small file of weights and a config.
+"""Policies on disk: one small file of parameters and a config.
 
-The folder of a policy holds ``weights.npz``, ``config.json`` (what the network is, the hash of
-the weights, how they were made), ``goals.npz`` (a sample of the goals of the training) and, beside them,
-whatever the release adds.
+The folder of a policy holds ``weights.npz`` (the parameters), ``config.json`` (the network's config, the
+hash of the parameters, and how they were trained), ``goals.npz`` (a sample of the goals in the training
+data) and further files that a release adds.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ from mgpo_jax.seen_goals import MOST_KEPT, SeenGoals
 from mgpo_jax.settings import ENCODERS, Index
 from mgpo_jax.transformer import NetworkConfig, TransformerConfig
 
-FORMAT = 2  # 1 had flat observations of size obs_dim
+FORMAT = 2  # version 1 had flat observations of size obs_dim
 WEIGHTS = "weights.npz"
 CONFIG = "config.json"
-GOALS = "goals.npz"  # of the training
-BEFORE = "before"  # the folder of the old policy for the moment in which the new one takes its name
+GOALS = "goals.npz"  # a sample of the goals in the training data
+BEFORE = "before"  # name of the old policy's folder while the new one takes its place
 MEND = "give the folder of another policy, or train it again"
 DTYPES = (
     "bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64",
@@ -66,19 +66,20 @@ def save_policy(
     made: dict[str, Any],
     seen_goals: SeenGoals | None = None,
 ) -> None:
-    """Write a policy, which replaces one that is there; other files beside that one stay.
+    """Write a policy to a folder.
 
-    However the process ends, the folder holds the old policy or the new one, whole.
+    A policy that is there is replaced, and other files in the folder are kept. The replacement is atomic:
+    however the process ends, the folder holds either the old policy or the new one.
 
     Args:
-      folder: where to.
-      config: the network.
-      params: its weights.
-      made: how it was made (environment, command, results).
-      seen_goals: the goals of its training.
+      folder: the folder of the policy.
+      config: the network's config.
+      params: its parameters.
+      made: how it was trained (environment, command, results).
+      seen_goals: the goals in its training data.
 
     Raises:
-      DataError: if a weight is not finite.
+      DataError: if a parameter is not finite.
     """
     folder = Path(folder)
     arrays = {name: np.asarray(leaf) for name, leaf in flatten_dict(params, sep="/").items()}
@@ -98,14 +99,14 @@ def save_policy(
 
 
 class _Files(NamedTuple):
-    """What the npz files of a policy hold."""
+    """The contents of a policy's npz files."""
 
     weights: Mapping[str, np.ndarray]
     seen_goals: SeenGoals | None
 
 
 def _exchange(folder: Path, files: _Files, document: Mapping[str, Any]) -> None:
-    """Write a policy beside the folder of another one, with what else lies there, and exchange the two."""
+    """Write a policy next to an existing folder, copy that folder's other files, and exchange the two."""
     partial = partial_name(folder)
     with claimed(partial):
         place, before = partial / PLACE, partial / BEFORE
@@ -127,7 +128,7 @@ def _exchange(folder: Path, files: _Files, document: Mapping[str, Any]) -> None:
 
 
 def _finish_exchange(folder: Path) -> None:
-    """Put the old policy back, or remove it, where a process was killed while it exchanged two."""
+    """Put the old policy back, or remove it, after a process was killed while it exchanged two folders."""
     folder = folder.resolve()
     before = partial_name(folder) / BEFORE
     if before.is_dir():
@@ -137,7 +138,7 @@ def _finish_exchange(folder: Path) -> None:
 
 
 def _put_back(before: Path, folder: Path) -> None:
-    """Give a folder that was moved away its name back, unless another one has it."""
+    """Rename a folder that was moved away back to its old name, unless the new one has taken that."""
     if before.is_dir() and not os.path.lexists(folder):
         os.rename(before, folder)
 
@@ -152,13 +153,13 @@ def _write_policy(folder: Path, files: _Files, document: Mapping[str, Any]) -> N
 def load_policy(
     world: World | str | None = None, path: Path | str | None = None, kind: str = MULTI_GOAL
 ) -> LoadedPolicy:
-    """The policy in a folder (default: the released one), checked against the world.
+    """Load the policy in a folder (default: the released one) and check it against its world.
 
     Args:
       world: the world, its name, or its place as ``module:attribute``; None for a policy that was trained
-        on data of no world, which is checked by itself alone.
-      path: folder of a policy; without a world it has to be given.
-      kind: the kind of network that it must be (default: one that follows prompts).
+        on data of an unregistered world, which is checked only by itself.
+      path: the folder of the policy; required if there is no world.
+      kind: the kind of network that it must be (default: the multi-goal policy).
 
     Raises:
       UsageError: if there is no policy at that place, or one of another kind.
@@ -167,7 +168,7 @@ def load_policy(
     world = find(world) if isinstance(world, str) else world
     if world is None and not path:
         raise UsageError("name a world, or give the folder of a policy as path")
-    folder = Path(path) if path else released_folder(_there(world), kind)
+    folder = Path(path) if path else released_folder(_not_none(world), kind)
     policy = read_policy(folder, None if world is None else world.make().spec, kind)
     found = kind_of(policy.config).name
     if found != kind:
@@ -179,13 +180,14 @@ def load_policy(
     return policy
 
 
-def _there(world: World | None) -> World:
-    assert world is not None  # as the caller has seen to
+def _not_none(world: World | None) -> World:
+    """The world, which the caller has checked to be given."""
+    assert world is not None
     return world
 
 
 def method_flag(kind: str) -> str:
-    """The flag with which a kind of network is trained; empty for the one that follows prompts."""
+    """The flag of ``pretrain`` that trains a kind of network; empty for the multi-goal policy."""
     return "" if kind == MULTI_GOAL else f" --method {kind}"
 
 
@@ -193,9 +195,9 @@ def read_policy(folder: Path, spec: EnvSpec | None = None, kind: str = MULTI_GOA
     """Read a policy from its folder.
 
     Args:
-      folder: where ``save_policy`` wrote it.
-      spec: the world it must fit.
-      kind: the kind of network that is looked for, for the message that there is none.
+      folder: the folder that ``save_policy`` wrote.
+      spec: the specification of the world that it must fit.
+      kind: the kind of network that is wanted, for the message if there is none.
 
     Raises:
       UsageError: if there is no policy at that place.
@@ -233,7 +235,7 @@ def read_policy(folder: Path, spec: EnvSpec | None = None, kind: str = MULTI_GOA
 
 
 def hash_in_config(folder: Path) -> str | None:
-    """The hash of the weights that the config of a policy names; None where there is no config.
+    """The hash of the parameters according to a policy's config; None if there is no config.
 
     Raises:
       DataError: if the config is damaged.
@@ -280,7 +282,7 @@ SIZES = ("embed_dim", "num_layers", "num_heads", "max_prompt_length")  # never l
 
 
 class _Made(BaseModel):
-    """What is known of the entries of ``made``; there may be others."""
+    """The known entries of ``made``; further ones are allowed."""
 
     model_config = {**STRICT, "extra": "ignore"}
 
@@ -297,7 +299,7 @@ class _Config(NamedTuple):
 
 
 def _read_config(folder: Path) -> _Config:
-    """The config of a policy."""
+    """Read the config of a policy and check it."""
     path = folder / CONFIG
     document: _Document = read_document(path, _Document, MEND)
     if document.format not in (1, FORMAT):
@@ -320,7 +322,7 @@ def _read_config(folder: Path) -> _Config:
 
 
 def _fault(config: NetworkConfig) -> str | None:
-    """What of a network does not fit together, after its types and ranges have been found right."""
+    """What is wrong with a network's config, beyond types and ranges; None if nothing is."""
     if config.head not in HEADS:
         return f"head must be one of {', '.join(HEADS)}, found {shown(config.head)}"
     if config.encoder not in (known := ENCODERS.names()):
@@ -337,7 +339,7 @@ def _fault(config: NetworkConfig) -> str | None:
 
 
 def _layout_fault(config: NetworkConfig) -> str | None:
-    """What is wrong with the layout of observations in a network's config."""
+    """What is wrong with the layout of observations in a network's config; None if nothing is."""
     layout = config.obs_layout
     encoder = ENCODERS.find(config.encoder)
     if not encoder.uses_layout:
@@ -351,7 +353,7 @@ def _layout_fault(config: NetworkConfig) -> str | None:
 
 
 def _check_blocks(path: Path, config: TransformerConfig) -> None:
-    """Raise ``DataError`` for another number of blocks in the weights, before a network is built for it."""
+    """Raise ``DataError`` if the weights have another number of blocks, before a network is built."""
     names = (re.match(r"params/blocks_(\d+)/", name) for name in array_names(path, MEND))
     found = len({match[1] for match in names if match})
     if found != config.num_layers:
@@ -361,6 +363,6 @@ def _check_blocks(path: Path, config: TransformerConfig) -> None:
 
 
 def _shapes(config: NetworkConfig) -> Any:
-    """Shapes of the params, without computing them."""
+    """The shapes of the parameters, without computing any."""
     init = kind_of(config).load().init
     return jax.eval_shape(lambda: init(jax.random.key(0), config))

@@ -1,11 +1,11 @@
-"""The processes that run one command together: who they are, and what they tell each other on the host.
+"""The processes that run one command together, and host-side communication between them.
 
-Process 0 has a connection to each of the others. What is small or has no fixed size goes through it: facts
-that must agree, finished pieces of work, requests to stop, and the news that a process has failed. The
-operating system closes the connections of a process that ends, however it ends, so that the others learn
-of it at once, which a collective on devices does not promise. Gradients and lanes go another way
-(``mgpo_jax.sharding``). A command without ``--distributed`` is one process, and everything here is then
-answered without any connection. Nothing here imports jax.
+Process 0 has a socket connection to each of the others. Messages that are small or have no fixed size go
+through it: facts that must agree, finished pieces of work, requests to stop, and failures. The operating
+system closes the connections of a process however it ends, so the others notice at once, which a collective
+on devices does not guarantee. Gradients and lanes are exchanged by ``mgpo_jax.sharding``. A command without
+``--distributed`` is a single process, and then all functions here return without any communication. Nothing
+here imports jax.
 """
 
 from __future__ import annotations
@@ -30,22 +30,23 @@ from envs.errors import DataError, shown
 Value = TypeVar("Value")
 
 MEETING = 60.0  # seconds in which all processes must have connected
-# A host that has been silent for so many seconds is asked so many times, with seconds between, and then
-# counts as gone.
+# TCP keepalive: after ``SILENT`` seconds without traffic, ``PROBES`` probes are sent, ``BETWEEN`` seconds
+# apart; a host that answers none of them counts as gone.
 SILENT, PROBES, BETWEEN = 10, 3, 5
 
-_HEAD = struct.Struct(">cIQ")  # kind, number of the process it is from, bytes that follow
+_HEAD = struct.Struct(">cIQ")  # kind of message, index of the sender, number of bytes that follow
 _PIECE, _DONE, _SIGNAL, _FAILED, _GONE = b"p", b"d", b"s", b"f", b"g"
 SIGNAL, FAILED, GONE = "signal", "failed", "gone"
 _EVENTS = {_SIGNAL: SIGNAL, _FAILED: FAILED, _GONE: GONE}
 
 
 class DisagreementError(DataError):
-    """Processes that must do the same were started differently. All of them raise it, process 0 says it."""
+    """Processes that must do the same were started differently. All of them raise it; process 0 reports
+    it."""
 
 
 class Member(NamedTuple):
-    """One of the processes."""
+    """One of the processes that run a command together."""
 
     number: int
     host: str
@@ -56,15 +57,16 @@ class Member(NamedTuple):
 
 
 class Team:
-    """The processes of one command, as one of them sees them.
+    """The connections of this process to the other processes of a command.
 
     Args:
-      members: all of them, in order.
-      index: which of them this one is.
-      links: connections by the number of the process at the other end: of process 0 to all others, of the
-        others to process 0.
-      heard: ``(event, member, text)``, called in another thread when a process is asked to stop by a
-        signal (``SIGNAL``; the text is its number), fails (``FAILED``; why) or is gone (``GONE``).
+      members: all processes, in order.
+      index: the index of this process.
+      links: connections by the index of the process at the other end: from process 0 to all others, from
+        the others to process 0.
+      heard: ``(event, member, text)``, a callback that runs in another thread when a process is asked to
+        stop by a signal (``SIGNAL``; the text is the signal's number), fails (``FAILED``; the text is the
+        reason) or is gone (``GONE``).
     """
 
     def __init__(
@@ -80,7 +82,7 @@ class Team:
             number: queue.SimpleQueue() for number in links
         }
         self._locks = {number: threading.Lock() for number in links}
-        self._done: set[int] = set()  # those that have nothing more to say
+        self._done: set[int] = set()  # processes that have said goodbye
         self._leaving = False
         self._readers = [
             threading.Thread(target=self._read, args=(number,), daemon=True) for number in links
@@ -89,7 +91,10 @@ class Team:
             reader.start()
 
     def combine(self, piece: bytes, make: Callable[[list[bytes]], bytes]) -> bytes:
-        """What process 0 makes of the pieces that all give, in their order; each must call this."""
+        """Apply ``make`` in process 0 to the pieces of all processes, in order, and broadcast the result.
+
+        Every process must call this.
+        """
         if self.index:
             self._send(0, _PIECE, piece)
             return self._pieces[0].get()
@@ -99,13 +104,13 @@ class Team:
         return made
 
     def tell(self, event: str, text: str) -> None:
-        """Tell all others of a signal to this process, or of its failure."""
+        """Tell all other processes about a signal to this process, or about its failure."""
         kind = next(kind for kind, name in _EVENTS.items() if name == event)
         for number in self._links:
             self._send(number, kind, text.encode())
 
     def leave(self, wait: bool) -> None:
-        """End all connections, after everybody has come this far if ``wait``."""
+        """Close all connections; with ``wait``, after all processes have called this."""
         if wait and self.index:
             self._send(0, _DONE, b"")
             self._pieces[0].get()
@@ -121,9 +126,10 @@ class Team:
             link.close()
 
     def outlast(self, seconds: float) -> None:
-        """Wait for the others to end, at most so long.
+        """Wait for the others to end, for at most ``seconds``.
 
-        jax aborts a process, with pages of text, when process 0 ends before it without a farewell.
+        If process 0 ends before another process without shutting down properly, jax aborts that process
+        with pages of text.
         """
         end = time.monotonic() + seconds
         for reader in self._readers:
@@ -131,7 +137,7 @@ class Team:
 
     def _send(self, number: int, kind: bytes, text: bytes, source: int | None = None) -> None:
         source = self.index if source is None else source
-        # A connection that is broken is noticed by its reader, which knows what to do.
+        # The thread that reads from a broken connection notices and handles it.
         with suppress(OSError), self._locks[number]:
             self._links[number].sendall(_HEAD.pack(kind, source, len(text)) + text)
 
@@ -146,11 +152,11 @@ class Team:
                 if kind in (_PIECE, _DONE):
                     self._pieces[number].put(text)
                 else:
-                    self._pass_on(kind, source, text)
+                    self._forward(kind, source, text)
         if not self._leaving and number not in self._done:
-            self._pass_on(_GONE, number, b"")
+            self._forward(_GONE, number, b"")
 
-    def _pass_on(self, kind: bytes, source: int, text: bytes) -> None:
+    def _forward(self, kind: bytes, source: int, text: bytes) -> None:
         if not self.index:
             for number in self._links:
                 if number != source:
@@ -159,7 +165,7 @@ class Team:
 
 
 def _received(link: socket.socket, size: int) -> bytes:
-    """So many bytes; none if the connection ends before."""
+    """Receive ``size`` bytes; returns none if the connection ends first."""
     pieces = bytearray()
     while len(pieces) < size:
         piece = link.recv(min(size - len(pieces), 1 << 20))
@@ -182,7 +188,7 @@ def _unpacked(text: bytes) -> Iterator[bytes]:
 
 
 class Door:
-    """Where process 0 waits for the others; only who knows the password is let in."""
+    """The listening socket on which process 0 waits for the others, who must know the password."""
 
     def __init__(self, only_here: bool) -> None:
         self._listening = socket.create_server(("127.0.0.1" if only_here else "", 0))
@@ -190,10 +196,13 @@ class Door:
         self.port = self._listening.getsockname()[1]
 
     def let_in(self, members: Sequence[Member]) -> dict[int, socket.socket]:
-        """The connections of all others, by their numbers; the door is closed afterwards.
+        """Accept the connections of all other processes, and then close the socket.
+
+        Returns:
+          The connections by the index of the process.
 
         Raises:
-          DataError: if one of them does not come in time.
+          DataError: if a process does not connect in time.
         """
         links: dict[int, socket.socket] = {}
         end = time.monotonic() + MEETING
@@ -211,14 +220,14 @@ class Door:
                         f"{MEETING:.0f} s; see whether the network lets it"
                     ) from None
                 if secrets.compare_digest(said[:-4], self.password):
-                    links[struct.unpack(">I", said[-4:])[0]] = _kept_alive(link)
+                    links[struct.unpack(">I", said[-4:])[0]] = _with_keepalive(link)
                 else:
                     link.close()
         return links
 
 
 def connected(places: Sequence[str], port: int, password: bytes, index: int) -> socket.socket:
-    """The connection of a process to process 0, at the first of some names of its host that answers.
+    """Connect to process 0 at the first of several host names that answers.
 
     Raises:
       DataError: if none answers.
@@ -228,14 +237,14 @@ def connected(places: Sequence[str], port: int, password: bytes, index: int) -> 
         try:
             link = socket.create_connection((place, port), timeout=MEETING)
             link.sendall(password + struct.pack(">I", index))
-            return _kept_alive(link)
+            return _with_keepalive(link)
         except OSError as error:
             fault = f"{place}:{port}: {error}"
     raise DataError(f"process 0 cannot be reached at {fault}; see whether the network lets it")
 
 
-def _kept_alive(link: socket.socket) -> socket.socket:
-    """The connection, which ends soon after the host at its other end is gone."""
+def _with_keepalive(link: socket.socket) -> socket.socket:
+    """Enable keepalive on a connection, so that it ends soon after the host at its other end is gone."""
     link.settimeout(None)
     link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     link.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -246,13 +255,13 @@ def _kept_alive(link: socket.socket) -> socket.socket:
         ("TCP_KEEPCNT", PROBES),
         ("TCP_USER_TIMEOUT", milliseconds),
     ):
-        if hasattr(socket, name):  # where it is missing, the system's own patience counts
+        if hasattr(socket, name):  # otherwise the system's default applies
             link.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
     return link
 
 
 class _Present:
-    """Which processes work together at present."""
+    """The team of processes at present (global state of this process)."""
 
     team: Team | None = None
     apart = False
@@ -262,7 +271,7 @@ _present = _Present()
 
 
 def join(team: Team | None) -> None:
-    """Be one of several processes from now on, or (None) the only one."""
+    """Work as one of several processes from now on, or (with None) as the only one."""
     _present.team = team
 
 
@@ -277,7 +286,7 @@ def _together() -> Team | None:
 
 @contextmanager
 def apart() -> Iterator[None]:
-    """In the block this process works as if it were the only one, on devices of its own."""
+    """Within the block, work as if this process were the only one, on its own devices."""
     before, _present.apart = _present.apart, True
     try:
         yield
@@ -286,29 +295,29 @@ def apart() -> Iterator[None]:
 
 
 def count() -> int:
-    """How many processes work together."""
+    """The number of processes that work together."""
     return len(now.members) if (now := _together()) else 1
 
 
 def index() -> int:
-    """The number of this process."""
+    """The index of this process, from 0."""
     return now.index if (now := _together()) else 0
 
 
 def is_first() -> bool:
-    """Whether this process is the one that prints, draws and writes."""
+    """Whether this is process 0, the one that prints, draws and writes files."""
     return index() == 0
 
 
 def exchange(piece: bytes) -> list[bytes]:
-    """The pieces that all processes give, in their order; each must call this."""
+    """All-gather: the pieces of all processes, in order. Every process must call this."""
     return list(_unpacked(combined(piece, _packed)))
 
 
 def combined(piece: bytes, make: Callable[[list[bytes]], bytes]) -> bytes:
-    """What process 0 makes of the pieces that all processes give, in their order; each must call this.
+    """Apply ``make`` in process 0 to the pieces of all processes, in order, and broadcast the result.
 
-    The others need not have what it keeps for itself.
+    Every process must call this. Only process 0 calls ``make``, which may use data that only process 0 has.
     """
     return now.combine(piece, make) if (now := _together()) else make([piece])
 
@@ -319,7 +328,7 @@ def total(number: float) -> float:
 
 
 def from_first(find: Callable[[], Value]) -> Value:
-    """What process 0 finds, a JSON value, on every process."""
+    """Broadcast: the JSON value that ``find`` returns in process 0, in every process."""
     if count() == 1:
         return find()
     return json.loads(exchange(json.dumps(find()).encode() if is_first() else b"")[0])
@@ -328,7 +337,8 @@ def from_first(find: Callable[[], Value]) -> Value:
 def arrays_from_first(
     find: Callable[[], Mapping[str, np.ndarray] | None],
 ) -> dict[str, np.ndarray] | None:
-    """The arrays that process 0 finds, on every process; None if it finds none."""
+    """Broadcast: the arrays that ``find`` returns in process 0, in every process; None if it returns
+    None."""
     if count() == 1:
         found = find()
         return None if found is None else dict(found)
@@ -340,7 +350,7 @@ def arrays_from_first(
 
 
 def to_bytes(arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Arrays by name as bytes."""
+    """Serialize named arrays."""
     file = io.BytesIO()
     named: Any = arrays
     np.savez(file, allow_pickle=False, **named)
@@ -348,16 +358,16 @@ def to_bytes(arrays: Mapping[str, np.ndarray]) -> bytes:
 
 
 def from_bytes(text: bytes) -> dict[str, np.ndarray]:
-    """What ``to_bytes`` made bytes of."""
+    """Deserialize the output of ``to_bytes``."""
     with np.load(io.BytesIO(text), allow_pickle=False) as file:
         return dict(file)
 
 
 def check_agreed(facts: Mapping[str, Any]) -> None:
-    """Check that all processes have the same facts, JSON values by what they are.
+    """Check that all processes have the same facts, which are JSON values by a description of each.
 
     Raises:
-      DisagreementError: on all of them, if one differs from process 0; it names both and what differs.
+      DisagreementError: in all processes, if one differs from process 0; it names both and what differs.
     """
     if (team := _together()) is None:
         return
@@ -374,5 +384,5 @@ def check_agreed(facts: Mapping[str, Any]) -> None:
 
 
 def own_name() -> tuple[str, int]:
-    """Host and process number, for the other processes."""
+    """The host name and process id of this process, by which the others name it."""
     return socket.gethostname(), os.getpid()

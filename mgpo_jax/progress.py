@@ -1,4 +1,4 @@
-"""Progress of long work on stderr: a bar on a terminal, elsewhere a line every half minute."""
+"""Progress of long work on stderr: a bar on a terminal, otherwise a line every half minute."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from typing import Any
 
 from tqdm import tqdm
 
-EVERY = 30.0  # seconds between two lines where stderr is no terminal
+EVERY = 30.0  # seconds between two lines if stderr is not a terminal
 
 
 class Progress:
-    """Counts ``unit``s up to ``total``, and shows figures beside the count.
+    """A progress display that counts ``unit``s up to ``total``, with figures next to the count.
 
     Args:
-      total: how many there are.
+      total: the final count.
       unit: what is counted, such as ``step``.
-      initial: how many were done before.
+      initial: the count at the start, for resumed work.
     """
 
     def __init__(self, total: int, unit: str, initial: int = 0) -> None:
@@ -42,7 +42,7 @@ class Progress:
         self._done += num
 
     def show(self, figures: dict[str, str]) -> None:
-        """Figures to stand beside the count from now on."""
+        """Set the figures next to the count."""
         self._bar.set_postfix(figures)
         self._figures = "".join(f", {name} {value}" for name, value in figures.items())
 

@@ -1,8 +1,8 @@
-"""The one sampler of goal prompts, p ~ P(p | tau) (paper, section 3.1).
+"""Multi-goal prompts and their sampler, p ~ P(p | tau) (paper, section 3.1).
 
-Pre-training relabels the dataset with it in hindsight; adaptation draws new prompts from the best
-trajectory with it. Indices are drawn without replacement and kept in order, the number of goals is
-uniform in 1..K and clipped to the goals available, as in the authors' code.
+Pre-training uses the sampler to relabel the dataset in hindsight, and adaptation to draw new prompts from
+the best trajectory. As in the authors' code, goals are drawn without replacement and kept in the order of
+the trajectory, and their number is uniform in 1..K, clipped to the number of goals available.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from envs.errors import UsageError
 
 
 class Prompt(NamedTuple):
-    """A sequence of up to P goals, right-aligned: the last slot always holds the final goal."""
+    """A sequence of up to P goals, right-aligned in P slots: the last slot always holds the final goal."""
 
     goals: Float[Array, "*batch P G"]
     mask: Bool[Array, "*batch P"]
-    """Which slots hold a goal; the others are zero."""
+    """Which slots hold a goal; the goals in the other slots are zero."""
 
 
 def single_goal(goal: Float[Array, "G"], num_slots: int) -> Prompt:
-    """The prompt (g) of one goal in ``num_slots`` slots; (g^M) is where adaptation starts."""
+    """The prompt (g) of one goal in ``num_slots`` slots. Adaptation starts from (g^M)."""
     goals = jnp.zeros((num_slots, *goal.shape), goal.dtype).at[-1].set(goal)
     return Prompt(goals, jnp.arange(num_slots) == num_slots - 1)
 
@@ -36,7 +36,7 @@ def prompt_of(goals: Any, num_slots: int) -> Prompt:
     """The prompt of a sequence of goals; the last is usually the task goal g^M.
 
     Raises:
-      UsageError: if there are no goals, more than ``num_slots``, or numbers that are not finite.
+      UsageError: if there are no goals, more than ``num_slots``, or a number is not finite.
     """
     rows = np.asarray(goals, np.float32)
     if rows.ndim != 2 or not 1 <= len(rows) <= num_slots:
@@ -57,15 +57,15 @@ def goals_of(prompt: Prompt) -> np.ndarray:
 
 
 def hindsight_outcome(trajectory: Trajectory | Goals) -> Float[Array, "G"]:
-    """g_H: the task goal that the trajectory reached, read at its last real step."""
+    """g_H, the task goal that the trajectory accomplished, which is the outcome at its last real step."""
     return trajectory.outcomes[trajectory.length - 1]
 
 
 def until_reached(goals: Goals, goal: Float[Array, "G"]) -> Goals:
     """The goals up to the first step whose outcome is ``goal``; all of them if there is no such step.
 
-    An episode can go on after that step, for example when objects were switched on in a wrong order and
-    the task is therefore not solved. What the agent does then does not help to solve it.
+    An episode can continue after that step, for example if objects were switched on in a wrong order, so
+    that the task is not solved. The goals after that step do not help to solve it.
     """
     reached = jnp.all(goals.outcomes == goal, axis=-1)
     reached &= jnp.arange(len(reached)) < goals.length
@@ -73,7 +73,7 @@ def until_reached(goals: Goals, goal: Float[Array, "G"]) -> Goals:
     return goals._replace(length=length.astype(goals.length.dtype))
 
 
-# Long because of its documentation; the drawing itself is one thought.
+# Long because of its documentation; the body is a single procedure.
 def sample_prompt(
     key: PRNGKeyArray,
     trajectory: Trajectory | Goals,
@@ -86,23 +86,24 @@ def sample_prompt(
 
     Args:
       key: random key.
-      trajectory: where the goals come from. Candidates are the goals that were reached before its end.
-      final_goal: last goal of the prompt; in hindsight ``hindsight_outcome(trajectory)``, in
-        adaptation the task goal g^M.
+      trajectory: the trajectory to draw goals from. Candidates are the goals that it reached, except for
+        the final goal at its last step.
+      final_goal: the last goal of the prompt: ``hindsight_outcome(trajectory)`` in pre-training, the task
+        goal g^M in adaptation.
       num_slots: P, the number of slots of the returned prompt (static).
-      max_goals: K <= P, the largest number of goals with the final one (traced; default P).
-      kept: steps whose goals are in every prompt, as far as there is room. The number of goals is then
-        uniform between the number of kept goals and the number of candidates, and goals reached after
-        the last kept step come in a random order (not in the paper; default: no step is kept).
+      max_goals: K <= P, the largest number of goals, including the final one (traced; default P).
+      kept: which steps have goals that are in every prompt, as far as there is room (not in the paper;
+        default: none). The number of goals is then uniform between the number of kept goals and the number
+        of candidates, and goals reached after the last kept step are in a random order.
 
     Returns:
-      A right-aligned prompt. Its goals are in the order in which the trajectory reached them, except
+      A right-aligned prompt. Its goals are in the order in which the trajectory reached them, except for
       those that ``kept`` leaves in a random order.
     """
     key_count, key_index = jax.random.split(key)
     num_steps = trajectory.goal_reached.shape[0]
     time = jnp.arange(num_steps)
-    # The step that reaches the final goal would only repeat it.
+    # The goal of the step that reaches the final goal would only repeat it.
     repeats_end = (time == trajectory.length - 1) & jnp.all(
         trajectory.achieved_goals == trajectory.outcomes, axis=-1
     )
@@ -124,7 +125,7 @@ def sample_prompt(
     _, drawn = jax.lax.top_k(scores, num_drawn)
     used, place = rank < count, drawn
     if kept is not None:
-        # Those after the last kept step stay as they were drawn: at random.
+        # Goals after the last kept step stay in the random order in which they were drawn.
         place = jnp.where(drawn > jnp.max(jnp.where(kept, time, -1)), num_steps + rank, drawn)
     order = jnp.argsort(jnp.where(used, place, -1))  # unused slots first
     drawn, used = drawn[order], used[order]

@@ -1,4 +1,4 @@
-"""Where the released policies and test tasks of the worlds lie. Nothing here imports jax."""
+"""The location of released policies and test tasks. Nothing here imports jax."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ RELEASED = Path(__file__).parent / "pretrained"
 
 
 def released_folder(world: World, kind: str = MULTI_GOAL) -> Path:
-    """Where the released policy and the test tasks of a world lie, or its network of another kind."""
+    """The folder of the released policy and the test tasks of a world, or of its network of another
+    kind."""
     home = RELEASED / world.home
     return home if kind == MULTI_GOAL else home / kind

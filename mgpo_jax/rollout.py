@@ -14,19 +14,19 @@ from mgpo_jax.prompts import Prompt
 
 
 class Query(NamedTuple):
-    """How a policy is to act in one episode."""
+    """A prompt, and how a policy acts under it in one episode."""
 
     prompt: Prompt
     greedy: Bool[Array, "*batch"]
-    """Whether to act by the mode of the action distribution instead of exploring."""
+    """Whether to take the mode of the action distribution instead of an exploratory action."""
     temperature: Float[Array, "*batch"] | None = None
-    """Of the distribution that exploring actions are drawn from (None: the policy's own)."""
+    """Temperature of the distribution from which exploratory actions are drawn (None: the policy's own)."""
 
 
 def rollout(
     key: PRNGKeyArray, env: Environment, policy: Policy, task: Task, query: Query
 ) -> Episode:
-    """One episode of ``policy`` on ``task`` as ``query`` wants it."""
+    """Run one episode of ``policy`` on ``task``, under the prompt of ``query``."""
     return run_episode(key, env, prompted(policy, query), task)
 
 
@@ -36,7 +36,7 @@ def act(
     greedy: bool | Bool[Array, ""],
     temperature: Float[Array, ""] | None = None,
 ) -> Array:
-    """An action from a distribution: its mode, or a random one at a temperature."""
+    """An action from a distribution: its mode if ``greedy``, otherwise a random one."""
     explored = distribution if temperature is None else distribution.tempered(temperature)
     return jnp.where(greedy, distribution.mode(), explored.explore(key))
 

@@ -1,7 +1,8 @@
-"""Adapts to many tasks at once. Everything that commands and examples search with goes through here.
+"""Adaptation to many tasks at once. All commands and examples that search for prompts use this module.
 
-A run is cut into segments of rounds, each followed by a judgement of the best choice so far. All lanes
-(``mgpo_jax.lanes``) take a segment together in one compiled program; what is finished is kept in a journal.
+A run is divided into segments of rounds, each followed by a judgement of the best choice so far. All lanes
+(``mgpo_jax.lanes``) run a segment together in one compiled program. Finished segments are saved in a
+journal, so that an interrupted run can be resumed.
 """
 
 from __future__ import annotations
@@ -57,19 +58,19 @@ def adapt(
     judged: Judgement | None = None,
     keep_actions: bool = False,
 ) -> Outcome:
-    """Adapt a policy to every task with every seed.
+    """Adapt a policy to every task, with several random seeds.
 
     Args:
-      world: the world, as its record, its name or place, or as an environment.
-      policy: who starts.
+      world: the world, as its record, its name, its place (``module:attribute``), or an environment.
+      policy: the policy that every adaptation starts from.
       tasks: N tasks, stacked.
-      method: who adapts, as a record or by name.
-      hyper: the method's hyper-parameters, as its record or as a dict of those that differ from the
-        defaults, which a world's record may change.
-      seeds: independent adaptations to each task.
-      episodes: the budget of each.
-      seed: seed of all of them.
-      eval_every: episodes between judgements of the best choice.
+      method: the method that adapts, as a record or by name.
+      hyper: the method's hyper-parameters, as an instance of its dataclass or as a dict of those that
+        differ from the defaults. A world's record may change the defaults.
+      seeds: number S of independent adaptations to each task.
+      episodes: the budget of each adaptation, in episodes.
+      seed: random seed of the whole run.
+      eval_every: number of episodes between judgements of the best choice.
       judged: how the best choice is judged (default: as the world's record says; for an environment
         without a record, one greedy episode).
       keep_actions: whether to keep continuous actions; discrete ones are always kept.
@@ -119,28 +120,32 @@ def sweep(
     journal: Journal | None = None,
     begin: Callable[[], object] = lambda: None,
 ) -> list[Outcome]:
-    """One outcome for each variant of a method's hyper-parameters, all from one program.
+    """Adapt with several variants of a method's hyper-parameters in one compiled program.
 
     Args:
       env: the world.
-      policy: who starts.
+      policy: the policy that every adaptation starts from.
       tasks: N tasks, stacked.
-      method: who adapts.
-      hypers: the variants, which see the same tasks and random keys and share one program.
-      seeds: independent adaptations to each task.
-      episodes: the budget of each.
-      seed: seed of all of them.
-      eval_every: episodes between judgements of the best choice.
+      method: the method that adapts.
+      hypers: the variants of its hyper-parameters. All of them see the same tasks and random keys.
+      seeds: number S of independent adaptations to each task.
+      episodes: the budget of each adaptation, in episodes.
+      seed: random seed of the whole run.
+      eval_every: number of episodes between judgements of the best choice.
       judged: how the best choice is judged (default: one greedy episode).
       keep_actions: whether to keep continuous actions; discrete ones are always kept.
-      stop_at: a search ends when its best choice is judged at this return or more (``stopping``); the
-        episodes that it did not need have the best return that it had seen, and no steps.
-      journal: where finished segments are kept; those that it holds are not run again.
-      begin: called once, when everything was found right and before anything is compiled.
+      stop_at: a search ends once its best choice is judged at this return or more (``stopping``). The
+        episodes it did not need are recorded with no steps and the best return seen before.
+      journal: saves finished segments; segments that it already holds are not run again.
+      begin: called once, after all checks and before anything is compiled.
+
+    Returns:
+      One outcome for each variant.
 
     Raises:
-      UsageError: for a number below 1, no tasks, results beyond the memory, or a method that does not fit.
-      DataError: if the policy was made for another world, or a return is not finite.
+      UsageError: if a number is below 1, there are no tasks, the results do not fit into memory, or the
+        method cannot be used in this setting.
+      DataError: if the policy was trained for another world, or a return is not finite.
     """
     _check_positive(seeds=seeds, episodes=episodes, eval_every=eval_every)
     setting = _checked_setting(env, policy, method, hypers, episodes, judged)
@@ -157,7 +162,7 @@ def sweep(
     params = replicate(layout.mesh, policy.params)
     run = Run(program, lanes, params, segments, grid, layout, num * grid.size, stop_at)
     record, cpu = _run(run, journal or Journal())
-    # The search, too, begins with one evaluation of the initial choice.
+    # The judgement of the initial choice is recorded at episode 1, since a search begins by evaluating it.
     after = np.concatenate([[1], np.cumsum(segments) * num])
     per_lane = episodes + (len(segments) + 1) * setting.judged.episodes
     total, cpu = round(layout.num_lanes * per_lane / grid.variants), cpu / grid.variants
@@ -172,7 +177,7 @@ def _checked_setting(
     episodes: int,
     judged: Judgement | None,
 ) -> Setting:
-    """What a method may know before it sees a task, if it can be used there."""
+    """The setting that a method works in, after checks that policy, world and method fit together."""
     check_fits(policy.config, env.spec)
     setting = Setting(env, policy.config, episodes, judged or Judgement())
     for hyper in hypers:
@@ -188,7 +193,7 @@ def _check_positive(**numbers: int) -> None:
 
 
 def _check_room(env: Environment, grid: Grid, episodes: int) -> None:
-    """Raise ``UsageError`` for an adaptation without tasks, or whose log does not fit into memory."""
+    """Raise ``UsageError`` if there are no tasks, or if the log would not fit into memory."""
     if not grid.size:
         raise UsageError("there are no tasks to adapt to")
     needed = log_bytes(env, grid.size, episodes)
@@ -201,13 +206,13 @@ def _check_room(env: Environment, grid: Grid, episodes: int) -> None:
 
 
 def log_bytes(env: Environment, num_lanes: int, episodes: int) -> int:
-    """Bytes of the log of so many adaptations at most: achieved goals and outcomes are most of it."""
+    """Upper bound of the bytes in the log of ``num_lanes`` adaptations, most of them goals and outcomes."""
     a_step = 2 * 4 * env.spec.goal_dim + 4
     return num_lanes * episodes * env.spec.horizon * a_step
 
 
 def _segments(adapter: Adapter, episodes: int, eval_every: int) -> list[int]:
-    """The budget as numbers of rounds between judgements; the last one is what is left."""
+    """The number of rounds in each segment of the budget; the last segment may be shorter."""
     num = adapter.episodes_per_round
     if episodes % num or eval_every % num:
         raise UsageError(
@@ -219,7 +224,7 @@ def _segments(adapter: Adapter, episodes: int, eval_every: int) -> list[int]:
 
 
 def _memory_bytes(env: Environment, adapter: Adapter, tasks: Task) -> int:
-    """Bytes of an agent's memory at the end of an episode."""
+    """Bytes of an agent's memory (such as its KV cache) at the end of a full-length episode."""
 
     def memory(key: PRNGKeyArray, task: Task) -> Any:
         search = adapter.init(key, env.task_goal(task))
@@ -234,14 +239,17 @@ def _memory_bytes(env: Environment, adapter: Adapter, tasks: Task) -> int:
 
 
 class Program:
-    """A jitted function that is compiled once for each set of shapes, outside of any measured time."""
+    """A jitted function that is compiled ahead of time, once for each set of argument shapes.
+
+    Separate compilation keeps the compile time out of measured times.
+    """
 
     def __init__(self, jitted: Any) -> None:
         self.jitted = jitted
         self._compiled: dict[Any, Any] = {}
 
     def compile(self, *args: Any) -> Any:
-        """The program for arguments of these shapes."""
+        """The compiled function for arguments of these shapes."""
         shapes, tree = jax.tree.flatten(jax.tree.map(jax.typeof, args))
         where = (tuple(shapes), tree)
         if where not in self._compiled:
@@ -255,7 +263,7 @@ class Programs(NamedTuple):
     start: Program
     """``(lanes, params) -> state``."""
     advance: Program
-    """``((state, lanes), (params, number of rounds, number of the judgement)) -> (state, log, judged)``."""
+    """``((state, lanes), (params, number of rounds, index of the segment)) -> (state, log, judged)``."""
 
 
 @cache
@@ -267,7 +275,7 @@ def _program(
     max_rounds: int,
     keep_actions: bool,
 ) -> Programs:
-    """The programs that search with a method; equal arguments share them within a process."""
+    """The programs of an adaptation; calls with equal arguments share them within a process."""
     env = setting.env
 
     def begin(own: Lanes, params: Any) -> Any:
@@ -297,7 +305,7 @@ def _program(
 
 
 class Run(NamedTuple):
-    """What an adaptation is made of."""
+    """The inputs of an adaptation, ready to be run."""
 
     programs: Programs
     lanes: Lanes
@@ -307,11 +315,12 @@ class Run(NamedTuple):
     grid: Grid
     layout: Layout
     per_round: int
-    """Episodes that all lanes together run in a round."""
+    """Number of episodes in a round, summed over the lanes of the grid."""
     stop_at: float | None
+    """Judged return at which a search ends early; None if none does."""
 
     def without(self, stopped: np.ndarray) -> Lanes:
-        """The lanes, of which some have ended; those beyond the grid repeat the first ones."""
+        """The lanes with the given ones marked as ended; lanes that pad the grid repeat its first ones."""
         index = np.arange(self.layout.num_lanes) % self.grid.size
         return self.lanes._replace(stopped=split(self.layout.mesh, jnp.asarray(stopped[index])))
 
@@ -319,12 +328,15 @@ class Run(NamedTuple):
 def _run(run: Run, journal: Journal) -> tuple[Record, float]:
     """Run all segments of an adaptation, each followed by a judgement.
 
-    Segments that the journal holds are not run again. Also returns the CPU time, without compilation.
+    Segments that the journal holds are not run again.
+
+    Returns:
+      The record of the run, and its CPU time in seconds without compilation.
     """
     programs, lanes, params, segments, grid, layout, per_round, stop_at = run
     state = programs.start.compile(lanes, params)(lanes, params)
-    # A method whose first state holds NaN means something by it.
-    watched = bool(_learns(state.search)) and not _broken(state.search, layout.mesh).any()
+    # If the initial state holds NaN, the method uses NaN on purpose, and it is no sign of divergence.
+    watched = bool(_float_leaves(state.search)) and not _has_nan(state.search, layout.mesh).any()
     shared = (params, jnp.int32(0), jnp.int32(0))
     advance = programs.advance.compile((state, lanes), shared)
     done: list[Segment] = []
@@ -353,7 +365,7 @@ def _run(run: Run, journal: Journal) -> tuple[Record, float]:
             if watched:
                 _check_sound(state.search, run, before + num)
             done.append(Segment(log, judged, cpu))
-            _keep(journal, number, done[-1], state, grid)
+            _save_segment(journal, number, done[-1], state, grid)
             progress.update(num * per_round)
             progress.show({"return": f"{judged.return_.mean():.3f}"})
             before += num
@@ -382,30 +394,32 @@ def _check_finite(log: AdaptLog, judged: Judged, grid: Grid, rounds_before: int)
     )
 
 
-def _learns(searches: Any) -> list[Array]:
-    """The numbers in the states of searches."""
+def _float_leaves(searches: Any) -> list[Array]:
+    """The floating-point arrays in the states of searches."""
     leaves = jax.tree.leaves(searches)
     return [leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)]
 
 
-def _broken(searches: Any, mesh: Mesh) -> np.ndarray:
-    """Which searches [lanes] hold NaN in their states."""
-    return fetch(_breaking(mesh)(_learns(searches)))
+def _has_nan(searches: Any, mesh: Mesh) -> np.ndarray:
+    """Whether the state of each search holds NaN, bool [lanes]."""
+    return fetch(_breaking(mesh)(_float_leaves(searches)))
 
 
 @cache
 def _breaking(mesh: Mesh) -> Any:
-    def broken(leaves: list[Array]) -> Bool[Array, "lanes"]:
+    """The compiled test for NaN: ``(arrays [lanes, ..]) -> bool [lanes]``."""
+
+    def has_nan(leaves: list[Array]) -> Bool[Array, "lanes"]:
         found = [jnp.isnan(leaf).reshape(len(leaf), -1).any(axis=1) for leaf in leaves]
         return jnp.any(jnp.stack(found), axis=0)
 
-    return on_devices(mesh, broken, [True], True)
+    return on_devices(mesh, has_nan, [True], True)
 
 
 def _check_sound(searches: Any, run: Run, rounds: int) -> None:
     """Raise ``DataError`` for the first search whose state holds NaN, such as weights that diverged."""
     grid = run.grid
-    if (broken := _broken(searches, run.layout.mesh)[: grid.size]).any():
+    if (broken := _has_nan(searches, run.layout.mesh)[: grid.size]).any():
         seed, task = divmod(int(np.argmax(broken)) % (grid.seeds * grid.tasks), grid.tasks)
         raise DataError(
             f"the search on task {task} with seed number {seed} has diverged: what it learned holds NaN "
@@ -413,8 +427,8 @@ def _check_sound(searches: Any, run: Run, rounds: int) -> None:
         )
 
 
-def _keep(journal: Journal, number: int, segment: Segment, state: Any, grid: Grid) -> None:
-    """Write a finished segment to the journal, and then the state that the next one starts from."""
+def _save_segment(journal: Journal, number: int, segment: Segment, state: Any, grid: Grid) -> None:
+    """Write a finished segment to the journal, and then the state from which the next segment starts."""
     if not journal.keeps:
         return
     journal.write(f"segment{number:04}", numbered_leaves(segment))
@@ -430,16 +444,16 @@ def _resumed(
     state: Any,
     shapes: tuple[Any, Any],
 ) -> tuple[list[Segment], Any]:
-    """The finished segments in a journal and the state after them.
+    """The finished segments in a journal, and the state after them.
 
-    If any of them is missing, there are none, and the state is the first one.
+    If any segment is missing, the run starts again: no segments are returned, with the initial ``state``.
     """
     records = [journal.read(f"segment{i:04}") for i in range(int(saved.pop("segments")))]
     like = Segment(*jax.tree.map(lambda leaf: 0, shapes), cpu_seconds=0.0)
     done = [with_leaves(like, record) for record in records if record is not None]
     if len(done) < len(records):
         return [], state
-    # The lanes beyond the grid repeat the first ones.
+    # The lanes that pad the grid repeat its first ones.
     index = np.arange(layout.num_lanes) % grid.size
 
     def placed(rows: Any, like: Any) -> Any:

@@ -1,8 +1,8 @@
-"""What settings and files must look like, with faults as plain sentences.
+"""Validation of settings and JSON files, with faults reported as plain sentences.
 
-A dataclass declares what is allowed in settings and JSON files: the type of a field is its type, and
-``Annotated`` adds its range, as in ``settings.TrainConfig``. pydantic checks it strictly: ``true`` is no
-number, ``"1"`` is no integer, and NaN and infinity are never allowed.
+A dataclass declares what is allowed: the types of its fields, to which ``Annotated`` adds ranges, as in
+``settings.TrainConfig``. pydantic validates strictly: ``true`` is not a number, ``"1"`` is not an integer,
+and NaN and infinity are never allowed.
 
 ``mgpo_jax.archives`` does the same for files of arrays.
 """
@@ -29,13 +29,13 @@ from pydantic_core import PydanticCustomError
 
 from envs.errors import DataError, printable, shown
 
-MAX_DOCUMENT = 16 << 20  # bytes of a JSON file; ours have some kB
+MAX_DOCUMENT = 16 << 20  # largest size of a JSON file in bytes; ours have a few kB
 STRICT = ConfigDict(strict=True, allow_inf_nan=False, extra="forbid")
 
 SHA256 = r"^[0-9a-f]{64}$"
 
 LIMITS: Mapping[str, str] = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
-"""The limits of a range in words."""
+"""The wording of each kind of limit."""
 
 _WORDS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
     "greater_than": lambda limits: _limit("gt", limits),
@@ -60,7 +60,7 @@ _WORDS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
         ("dict_type", "model_type", "dataclass_type"), lambda limits: "must be an object"
     ),
 }
-"""What pydantic calls a fault, in the words of a message."""
+"""Our wording of pydantic's error types."""
 
 
 def _limit(name: str, limits: Mapping[str, Any]) -> str:
@@ -74,7 +74,7 @@ def _pattern(pattern: str) -> str:
 
 
 def _all_finite(value: Any) -> Any:
-    """The JSON value, if it holds neither NaN nor infinity, which the parser lets pass."""
+    """The JSON value, after a check that it holds neither NaN nor infinity, which the parser accepts."""
     rest = [value]
     while rest:
         item = rest.pop()
@@ -85,15 +85,15 @@ def _all_finite(value: Any) -> Any:
 
 
 Json = Annotated[JsonValue, AfterValidator(_all_finite)]
-"""Anything that JSON can hold."""
+"""Any JSON value."""
 Sha256 = Annotated[str, StringConstraints(pattern=SHA256)]
-"""The hash of a file."""
+"""The SHA-256 hash of a file, in hexadecimal."""
 Name = Annotated[str, StringConstraints(pattern=r"^\w[\w.-]{0,99}(:\w[\w.]{0,99})?$")]
-"""The name of a world or a method, or its place as ``module:attribute``; it can stand in a path."""
+"""The name of a world or a method, or its place as ``module:attribute``; it is safe in a path."""
 DemonstratorName = Annotated[
     str, StringConstraints(max_length=200, pattern=r"^\w[\w.-]*(,\w+=[\w.+-]+)*$")
 ]
-"""The name of a demonstrator, with the settings that were changed; it can stand in a path."""
+"""The name of a demonstrator with its changed settings; it is safe in a path."""
 
 
 @cache
@@ -112,7 +112,7 @@ def fault(type_: Any, value: Any) -> str | None:
     >>> fault(Annotated[float, Gt(0)], -1.0)
     'must be above 0, found -1.0'
     """
-    if isinstance(value, np.generic):  # a number of numpy is as good as one of Python
+    if isinstance(value, np.generic):  # numpy scalars are accepted like Python numbers
         value = value.item()
     try:
         _adapter(type_).validate_python(value)
@@ -122,7 +122,7 @@ def fault(type_: Any, value: Any) -> str | None:
 
 
 def sentence(error: ValidationError, value: Any) -> str:
-    """The first fault of a value, as the end of a sentence with what was found."""
+    """The first fault of a value, as the end of a sentence that also says what was found."""
     first = error.errors(include_url=False)[0]
     words = _WORDS.get(first["type"])
     said = words(first.get("ctx", {})) if words else first["msg"][:1].lower() + first["msg"][1:]
@@ -130,35 +130,38 @@ def sentence(error: ValidationError, value: Any) -> str:
 
 
 def read_document(path: Path, type_: Any, mend: str = "") -> Any:
-    """The record in a JSON file.
+    """Read and validate a JSON file.
 
     Args:
       path: the file.
       type_: a pydantic model or a dataclass, with ``STRICT`` as its ``model_config`` or
         ``__pydantic_config__``.
-      mend: what mends a file that is not as it should be, the end of the message.
+      mend: how to mend a faulty file, the end of the message.
+
+    Returns:
+      An instance of ``type_``.
 
     Raises:
-      DataError: if the file is missing, is no JSON, or differs from what ``type_`` declares.
+      DataError: if the file is missing, is not JSON, or does not match ``type_``.
     """
     return _validated(read_text(path, mend), type_, path, mend)
 
 
 def checked_entry(value: Any, type_: Any, path: Path, entry: str, mend: str = "") -> Any:
-    """The record in one entry of a JSON file that was read before.
+    """Validate one entry of a JSON file that was read before; returns an instance of ``type_``.
 
     Raises:
-      DataError: if it differs from what ``type_`` declares; the message names file and entry.
+      DataError: if the entry does not match ``type_``; the message names the file and the entry.
     """
     return _validated(json.dumps(value).encode(), type_, path, mend, entry)
 
 
 def read_json_lines(path: Path, type_: Any, mend: str = "") -> list[Any]:
-    """The records in a file with one JSON value a line.
+    """Read and validate a file with one JSON value per line; returns instances of ``type_``.
 
     Raises:
-      DataError: if the file is missing, or a line differs from what ``type_`` declares; the message names
-        file and line.
+      DataError: if the file is missing, or a line does not match ``type_``; the message names the file and
+        the line.
     """
     lines = read_text(path, mend).splitlines()
     return [_validated(line, type_, f"{path}, line {n}", mend) for n, line in enumerate(lines, 1)]
@@ -175,7 +178,7 @@ def read_text(path: Path, mend: str = "") -> bytes:
     """The bytes of a small text file.
 
     Raises:
-      DataError: if it is missing, no file, too large or cannot be read.
+      DataError: if it is missing, not a file, too large, or cannot be read.
     """
     tail = tail_of(mend)
     try:
@@ -191,12 +194,13 @@ def read_text(path: Path, mend: str = "") -> bytes:
 
 
 def tail_of(mend: str) -> str:
-    """What mends a fault, as the end of a message."""
+    """The advice ``mend`` as the end of a message."""
     return f"; {mend}" if mend else ""
 
 
 def _document_fault(error: ValidationError, entry: str = "") -> str:
-    """The first fault of a document, or of one entry of it, to stand after the name of its file."""
+    """The first fault of a document, or of one entry of it; the text follows the file's name in a
+    message."""
     first = error.errors(include_url=False)[0]
     place = printable(".".join([entry] * bool(entry) + list(map(str, first["loc"]))))
     if first["type"] == "json_invalid":

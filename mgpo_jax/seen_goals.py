@@ -1,8 +1,8 @@
-"""Which goals a policy was trained on, and which goals of a prompt lie far from all of those.
+"""The goals that a policy was trained on, and a check of how far the goals of a prompt are from them.
 
-A policy follows goals that it has seen, and what lies between them; what it does under others is not known.
-Trained policies keep a sample of the goals that their demonstrations achieved (``goals.npz``), so that a
-prompt, which may come from a user or from an optimizer that invents goals, can be measured against it.
+A policy can follow goals like those in its training data; its behavior under other goals is unknown.
+Policies therefore keep a sample of the goals that their demonstrations achieved (``goals.npz``). Prompts
+that come from users, or from optimizers that invent goals, can be compared with it.
 """
 
 from __future__ import annotations
@@ -14,23 +14,24 @@ from jaxtyping import Bool, Float
 
 from mgpo_jax.dataset import Dataset
 
-MOST_KEPT = 1024  # goals that a policy keeps
-MOST_COMPARED = 20_000  # goals of the data that those are chosen of
-MOST_TRAJECTORIES = 5_000  # of the data that are looked at
-AT_ONCE = 128  # goals whose distances to all kept ones are in memory together
-SEED = 0  # of what is drawn from larger data
+MOST_KEPT = 1024  # largest number of goals that a policy keeps
+MOST_COMPARED = 20_000  # largest number of goals from which these are chosen
+MOST_TRAJECTORIES = 5_000  # largest number of trajectories from which goals are taken
+AT_ONCE = 128  # number of goals whose distances to all kept ones are computed at once
+SEED = 0  # random seed of the subset of larger data
 EQUAL = 1e-5  # goals that differ by less, relative to the size of goals, are the same
 
 
 class SeenGoals(NamedTuple):
-    """A sample of the goals of a training that covers them."""
+    """A sample of the goals in the training data, chosen so that it covers them."""
 
     goals: Float[np.ndarray, "K G"]
     reach: float
-    """A goal further than this from all of ``goals`` is far from the training."""
+    """A goal farther than this from all of ``goals`` is far from the training data."""
 
     def distances(self, goals: Any) -> np.ndarray:
-        """Euclidean distances of goals ``[..., G]`` to the nearest of the training, in units of goals."""
+        """Euclidean distances of goals ``[..., G]`` to the nearest goal of the sample, in units of
+        goals."""
         rows = np.asarray(goals, np.float64)
         flat = rows.reshape(-1, rows.shape[-1])
         kept = self.goals.astype(np.float64)
@@ -41,11 +42,11 @@ class SeenGoals(NamedTuple):
         return np.concatenate(nearest).reshape(rows.shape[:-1])
 
     def far(self, goals: Any) -> Bool[np.ndarray, "..."]:
-        """Which goals ``[..., G]`` are far from all goals of the training."""
+        """Which goals ``[..., G]`` are far from the training data."""
         return self.distances(goals) > self.reach
 
     def joined(self, other: SeenGoals | None) -> SeenGoals:
-        """The goals of both, of a training that went on from another."""
+        """The union of both samples, for training that continued from another policy."""
         if other is None:
             return self
         both = covering(np.concatenate([self.goals, other.goals]))
@@ -53,13 +54,14 @@ class SeenGoals(NamedTuple):
 
 
 def seen_in(dataset: Dataset, before: SeenGoals | None = None) -> SeenGoals:
-    """The goals that prompts of a dataset can hold, those of 5,000 trajectories where there are more.
+    """A sample of the goals that prompts drawn from a dataset can hold.
 
-    Those are the goals reached on the way, and the task goals that a trajectory accomplished in hindsight.
+    These are the goals that trajectories reached along the way, and the task goals that they accomplished
+    in hindsight. From larger datasets 5,000 trajectories are used.
 
     Args:
-      dataset: what a policy is trained on.
-      before: the goals of the training that this one goes on from, which count as well.
+      dataset: the training data.
+      before: the sample of the policy that training continues from, which is included.
     """
     rng = np.random.default_rng(SEED)
     which = np.arange(len(dataset))
@@ -76,13 +78,13 @@ def seen_in(dataset: Dataset, before: SeenGoals | None = None) -> SeenGoals:
 
 
 def covering(goals: Float[np.ndarray, "M G"]) -> SeenGoals:
-    """At most 1,024 goals that cover others, each the one furthest from those before it.
+    """Choose at most 1,024 of M goals that cover all of them, each the farthest from those before it.
 
-    A goal counts as far from them if it is further away than the least well covered of ``goals``, and
-    further than half the distance between the two that are closest to each other: goals that are all kept,
-    such as the cells of a maze, are taken for the points of a grid.
+    A goal counts as far from the sample if it is farther away than the least well covered one of ``goals``,
+    and farther than half the smallest distance between two goals of the sample. The second condition
+    matters if all goals are kept, such as the cells of a maze, which are treated as the points of a grid.
 
-    Source: the greedy choice of k centers of Gonzalez, *Clustering to minimize the maximum intercluster
+    Source: the greedy choice of k centers in Gonzalez, *Clustering to minimize the maximum intercluster
     distance*, 1985. The paper has no such check.
     """
     distinct = np.unique(np.asarray(goals, np.float32), axis=0)
@@ -99,25 +101,27 @@ def covering(goals: Float[np.ndarray, "M G"]) -> SeenGoals:
         gaps.append(float(distance[furthest]))
         distance = np.minimum(distance, np.linalg.norm(rows - rows[furthest], axis=1))
     radius = float(distance.max())
-    # Distances to what was chosen before only fall, so that the last gap is the closest pair's.
+    # The distance of each new goal to those before it only decreases, so the last gap is that of the
+    # closest pair.
     reach = max(radius, gaps[-1] / 2 if gaps else 0.0, same)
     return SeenGoals(distinct[np.asarray(chosen)], reach)
 
 
 def warning_of_goals(seen: SeenGoals | None, goals: Any, what: str) -> str:
-    """A sentence on goals that are far from those of the training; empty if none is, or nothing is known.
+    """A warning about goals that are far from the training data; empty if none is, or nothing is known.
 
     Args:
-      seen: the goals of the training.
-      goals: goals ``[N, G]``, each of one task.
-      what: what they are, in the plural.
+      seen: the sample of the training goals, if it was kept.
+      goals: goals ``[N, G]``, one of each task.
+      what: what the goals are, as a plural noun for the message.
     """
     alone = np.asarray(goals)[:, None]  # as prompts of one goal
     return warning_of_prompts(seen, alone, np.ones(alone.shape[:2], bool), what)
 
 
 def warning_of_prompts(seen: SeenGoals | None, goals: Any, mask: Any, what: str) -> str:
-    """The same for prompts with goals ``[..., P, G]`` and masks ``[..., P]``: one far goal is enough."""
+    """The same warning for prompts with goals ``[..., P, G]`` and masks ``[..., P]`` that hold any far
+    goal."""
     if seen is None:
         return ""
     distances = np.where(np.asarray(mask), seen.distances(goals), 0.0)

@@ -1,8 +1,9 @@
 """Settings as frozen dataclasses, with the ranges of their values. Nothing here imports jax.
 
-A setting is a field with a type and a docstring. Its flag, its help text and its check come from this one
-declaration: the docstring says what it is and in which unit it counts, and the type holds the range, such
-as ``Count`` or ``Annotated[float, Gt(0)]``. ``check_settings`` serves command lines and library calls.
+A setting is a dataclass field with a type and a docstring, from which its flag, its help text and its check
+are made. The docstring says what it is and in which unit it is measured, and the type holds its range, such
+as ``Count`` or ``Annotated[float, Gt(0)]``. ``check_settings`` checks the settings of command lines and of
+library calls.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from envs.errors import UsageError, nearest, shown
 from envs.registry import ENCODER_PLACES, Encoder, Registry
 from mgpo_jax.schema import LIMITS, fault
 
-# Numbers enter programs with 32 bits. Sizes have upper bounds where more could only fill the memory.
+# Numbers are 32-bit in compiled programs. Sizes have upper bounds beyond which they could only exhaust
+# memory.
 Count = Annotated[int, Ge(1), Lt(2**31)]
 Index = Annotated[int, Ge(0), Lt(2**31)]
 Seed = Annotated[int, Ge(0), Lt(2**32)]
@@ -50,7 +52,7 @@ ENCODERS: Registry[Encoder] = Registry(
         **ENCODER_PLACES,
     },
 )
-"""The encoders by name; their modules need jax and are imported when they are used."""
+"""The encoders by name; their modules need jax and are imported only when they are used."""
 if TYPE_CHECKING:
     EncoderName = str
 else:
@@ -60,9 +62,9 @@ Head = Literal["categorical", "gaussian", "fixed_gaussian", "mixture", "binned"]
 
 
 def static(default: Any) -> Any:
-    """A field whose value decides about shapes, so that each value needs a program of its own.
+    """A dataclass field whose value determines shapes, so that every value needs its own compiled program.
 
-    Other numbers among the hyper-parameters of a method enter its program as data.
+    Other numbers among the hyper-parameters of a method are traced.
     """
     return dataclasses.field(default=default, metadata={"static": True})
 
@@ -77,12 +79,12 @@ def types_of(settings_class: type) -> dict[str, Any]:
     """The types of the settings of a dataclass, with their ranges."""
     try:
         return get_type_hints(settings_class, include_extras=True)
-    except NameError:  # a type of a user that only a type checker imports
+    except NameError:  # a user's type that is imported only for type checking
         return {}
 
 
 def check_settings(settings: Any) -> None:
-    """Raise ``UsageError`` for the first setting of a dataclass that is not what its type allows."""
+    """Raise ``UsageError`` for the first field of a dataclass whose value its type does not allow."""
     values = {field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)}
     check_values(type(settings), values)
     for value in values.values():
@@ -91,9 +93,9 @@ def check_settings(settings: Any) -> None:
 
 
 def check_values(settings_class: type, values: Mapping[str, Any]) -> None:
-    """Raise ``UsageError`` for the first value that a dataclass of settings must not be made of.
+    """Raise ``UsageError`` for the first value that is not allowed for a field of a settings dataclass.
 
-    Values that are dataclasses of settings themselves are not checked.
+    Values that are settings dataclasses themselves are not checked.
     """
     known = types_of(settings_class)
     for name, value in values.items():
@@ -107,7 +109,7 @@ def check_values(settings_class: type, values: Mapping[str, Any]) -> None:
 
 
 def is_settings(value: Any) -> bool:
-    """Whether a value is a dataclass, and no class."""
+    """Whether a value is an instance of a dataclass."""
     return dataclasses.is_dataclass(value) and not isinstance(value, type)
 
 
@@ -115,12 +117,12 @@ def setting_fault(annotation: Any, value: Any) -> str | None:
     """What is wrong with the value of a setting, as the end of a sentence; None if nothing is."""
     try:
         return fault(annotation, value)
-    except PydanticUserError:  # a type of a user that pydantic does not know
+    except PydanticUserError:  # a user's type that pydantic does not know
         return None
 
 
 def get_parts(annotation: Any) -> Iterator[Any]:
-    """A type and the types that it is made of."""
+    """A type and all types that it is composed of."""
     yield annotation
     if get_origin(annotation) is not Literal:
         for part in get_args(annotation):
@@ -128,7 +130,7 @@ def get_parts(annotation: Any) -> Iterator[Any]:
 
 
 def range_of(annotation: Any) -> str:
-    """The range of a setting in words, such as "at least 1"; empty where it has none."""
+    """The range of a setting in words, such as "at least 1"; empty if it has none."""
     limits = [part for part in get_parts(annotation) if isinstance(part, Gt | Ge | Lt | Le)]
     return ", ".join(
         f"{LIMITS[name]} {value:.12g}"
@@ -138,13 +140,14 @@ def range_of(annotation: Any) -> str:
 
 
 RECIPE_NETWORK: dict[str, Any] = {"dropout": 0.0, "num_heads": 4}
-"""How the network of the general recipe differs from the paper's (Table 6)."""
+"""The fields in which the network of the general recipe differs from the paper's (Table 6)."""
 
 OF_WEIGHTS = (
     "max_prompt_length", "prompt_order", "embed_dim", "num_layers", "num_heads", "encoder", "head",
     "tokens_per_step",
 )  # fmt: skip
-"""Settings of a network that its weights were made for; dropout is none, since it only trains."""
+"""The settings of a network that its parameters depend on. Dropout is not among them, since it only affects
+training."""
 
 
 def check_contradictions(
@@ -153,13 +156,13 @@ def check_contradictions(
     where: str,
     mend: str = "leave it out",
 ) -> None:
-    """Raise ``UsageError`` for the first setting of a network that its weights were not made for.
+    """Raise ``UsageError`` for the first setting of a network that contradicts its parameters.
 
     Args:
-      given: settings by name, as a user wants them; None for one that is left open.
-      network: those that belong to the weights; others are not looked at.
-      where: whose weights they are, for the message.
-      mend: what mends it, the end of the message.
+      given: settings by name, as the user gave them; None for one that was not given.
+      network: the settings of the parameters, by name; other settings are ignored.
+      where: whose parameters they are, for the message.
+      mend: how to mend the contradiction, the end of the message.
     """
     for name, value in given.items():
         if name in network and value not in (None, network[name]):
@@ -171,33 +174,35 @@ def check_contradictions(
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """How to train. Values in brackets are the paper's (Table 6) or, marked *, its code's."""
+    """Settings of training. Values in brackets are the paper's (Table 6) or, marked *, those of its
+    code."""
 
     steps: Count = 24_000
-    """Gradient steps [50,000* to 200,000*, depending on the world]."""
+    """Number of gradient steps [50,000* to 200,000*, depending on the world]."""
     batch_size: BatchSize = 64
-    """Trajectories in a gradient step [64]."""
+    """Number of trajectories in a gradient step [64]."""
     optimizer: Literal["muon", "adamw"] = "muon"
     """Muon on the matrices of the blocks and AdamW on the rest, or AdamW alone [adamw]."""
     learning_rate: Annotated[float, Gt(0), Le(100)] = 3e-3
     """Peak learning rate [1e-4]."""
     warmup_steps: Index = 300
-    """Steps of linear warm-up, of which a shorter training has as many as it can [10,000]."""
+    """Number of steps of linear warm-up; a shorter run warms up until its last step [10,000]."""
     schedule: Literal["cosine", "constant"] = "cosine"
-    """Decay after warm-up: to 2 % along a cosine, or none [constant*]."""
+    """Decay of the learning rate after warm-up: to 2 % of its peak along a cosine, or none [constant*]."""
     weight_decay: Annotated[float, Ge(0), Le(1_000)] = 1e-4
     """Weight decay [1e-4]."""
     clip_norm: Positive = 1.0
     """Largest global norm of the gradient [0.25*]."""
     obs_noise: NotNegative = 0.0
-    """Largest standard deviation of the Gaussian noise that training adds to observations, in their
-    units [0]."""
+    """Largest standard deviation of the Gaussian noise added to observations in training, in their units
+    [0]."""
     part_size: BatchSize = 16
-    """Trajectories of nearly equal length that are computed at once, over all devices. A batch mixes as
-    many lengths as it has such parts."""
+    """Number of trajectories in a part of a batch (a microbatch), over all devices. Those of one part have
+    nearly equal lengths."""
     part_steps: Count = 1024
-    """Parts with more padded steps than this are halved, so that they fit into a core's cache."""
+    """Largest number of padded steps in a part; larger parts are halved, so that they fit into the cache of
+    a core."""
     bucket: BatchSize = 4
-    """Padded lengths are multiples of this many steps."""
+    """Padded lengths are rounded up to multiples of this many steps."""
     seed: Seed = 0
-    """Seed of the initial weights, batches, prompts and dropout."""
+    """Random seed of the initial parameters, batches, prompts and dropout."""

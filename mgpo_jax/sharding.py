@@ -1,13 +1,13 @@
-"""Spreading work over devices and fetching results: nothing else in the project does either.
+"""Spreading work over devices and fetching results. No other module of the project does either.
 
-One mesh with one axis serves pre-training, where trajectories are divided, and adaptation, where tasks
-and seeds are. On a CPU the devices are the cores (``experiments.runtime`` asks XLA for one device a core,
-because small programs on one core each waste less than one program on all).
+A mesh with one axis is used both for pre-training, where trajectories are divided among devices, and for
+adaptation, where lanes are. On a CPU the devices are the cores: ``experiments.runtime`` asks XLA for one
+device per core, because small programs on one core each are more efficient than one program on all cores.
 
-Where several processes work together (``mgpo_jax.processes``), each trains on its own devices and adds one
-row to the gradient; lanes are spread over the devices of all. **No collective ever runs between CPU devices
-of one process**: it waits for its peers on a thread of the pool that they need, and then stops for good.
-Collectives between processes do not, since each has a pool of its own.
+If several processes work together (``mgpo_jax.processes``), each trains on its own devices and contributes
+one row to the gradient, while lanes are spread over the devices of all processes. **No collective may run
+between CPU devices of one process**: it waits for its peers on a thread of the pool that they need
+themselves, which can deadlock. Collectives between processes cannot, since every process has its own pool.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ def mesh_of_all() -> Mesh:
 
 
 def devices_for(part_size: int) -> int:
-    """How many devices of each process share parts of a batch of ``part_size`` trajectories evenly.
+    """The number of devices per process among which parts of ``part_size`` trajectories divide evenly.
 
     Raises:
-      UsageError: if the processes themselves do not divide it.
+      UsageError: if ``part_size`` is not divisible by the number of processes.
     """
     own, rest = divmod(part_size, processes.count())
     if rest:
@@ -56,12 +56,12 @@ def devices_for(part_size: int) -> int:
 
 
 def spread(mesh: Mesh) -> NamedSharding:
-    """The layout of arrays whose leading axis is divided among the devices."""
+    """The sharding of arrays whose leading axis is divided among the devices."""
     return NamedSharding(mesh, PartitionSpec(AXIS))
 
 
 def split(mesh: Mesh, tree: Any) -> Any:
-    """Put arrays on the mesh, their leading axis divided among the devices."""
+    """Put arrays on the mesh, with their leading axis divided among the devices."""
     return _put(spread(mesh), tree)
 
 
@@ -71,7 +71,7 @@ def replicate(mesh: Mesh, tree: Any) -> Any:
 
 
 def _put(layout: NamedSharding, tree: Any) -> Any:
-    """Put arrays on a mesh; where it belongs to several processes, each puts what is its own."""
+    """Put arrays on a mesh; on a mesh of several processes, each puts the shards of its own devices."""
     if not layout.mesh.is_multi_process:
         return jax.device_put(tree, layout)
 
@@ -88,14 +88,14 @@ def _put(layout: NamedSharding, tree: Any) -> Any:
 def on_devices(
     mesh: Mesh, function: Callable, divided: Sequence[bool], result_divided: bool, **options: Any
 ) -> Any:
-    """A jitted function that runs on every device by itself, without collectives.
+    """A jitted function that runs on every device separately, without collectives.
 
     Args:
       mesh: the devices.
-      function: what runs on each of them.
-      divided: for each argument, whether its leading axis is divided among the devices; the others are
-        the same on all of them.
-      result_divided: the same for the result.
+      function: the function that runs on each device.
+      divided: for each argument, whether its leading axis is divided among the devices; other arguments are
+        replicated.
+      result_divided: whether the leading axis of the result is divided.
       **options: options of ``jax.jit``.
     """
     spec = {True: PartitionSpec(AXIS), False: PartitionSpec()}
@@ -110,9 +110,10 @@ def on_devices(
 
 
 def fetch(tree: Any) -> Any:
-    """Arrays of devices as numpy arrays; random keys become their raw data.
+    """Copy arrays from devices to numpy arrays; random keys become their raw data.
 
-    Arrays that are spread over several processes are gathered in all of them, so each must call this.
+    Arrays that are spread over several processes are gathered in all of them, so every process must call
+    this.
     """
 
     def raw(leaf: Any) -> Any:
@@ -125,7 +126,7 @@ def fetch(tree: Any) -> Any:
 
 
 def _gathered(tree: Any) -> Any:
-    """The same for arrays of several processes, which travel as one vector of bytes."""
+    """``fetch`` for arrays of several processes, which are exchanged as one vector of bytes."""
     leaves, shape = jax.tree.flatten(tree)
     own = [_own_rows(leaf) for leaf in leaves]
     vector = np.concatenate([np.frombuffer(rows.tobytes(), np.uint8) for rows in own])
@@ -143,7 +144,7 @@ def _gathered(tree: Any) -> Any:
 
 
 def _own_rows(leaf: Array) -> np.ndarray:
-    """The rows of an array on the devices of this process, in their order."""
+    """The rows of an array on the devices of this process, in order."""
     shards = leaf.addressable_shards
     if leaf.is_fully_replicated:
         return np.asarray(shards[0].data)
@@ -152,7 +153,8 @@ def _own_rows(leaf: Array) -> np.ndarray:
 
 
 def rows_of_processes(row: Array) -> Array:
-    """The vectors of all processes as rows, on the first device of each; each must call this."""
+    """Gather a vector of each process as rows, on the first device of each. Every process must call
+    this."""
     heads = _heads()
     check_collective(heads)
     own = jax.device_put(row, jax.local_devices()[0])[None]
@@ -163,7 +165,7 @@ def rows_of_processes(row: Array) -> Array:
 
 @cache
 def _heads() -> Mesh:
-    """One device of each process, so that no collective is between devices of one."""
+    """The mesh of one device of each process, so that no collective runs between devices of one process."""
     first: dict[int, Any] = {}
     for device in jax.devices():
         first.setdefault(device.process_index, device)
@@ -181,9 +183,9 @@ def is_key(leaf: Any) -> bool:
 
 
 def gather_rows(mesh: Mesh, tree: Any) -> list[Any]:
-    """The rows of arrays that have one row on each device, brought to the first device.
+    """Bring the rows of arrays with one row on each device to the first device.
 
-    They travel by plain copies: a collective can deadlock on the small thread pool of a CPU.
+    Plain copies are used, because a collective can deadlock on the small thread pool of a CPU.
     """
     home = mesh.devices.flat[0]
     return [
@@ -193,15 +195,15 @@ def gather_rows(mesh: Mesh, tree: Any) -> list[Any]:
 
 
 class Adding:
-    """Brings rows of arrays together, one from each device, to be added in their order.
+    """Collects rows of arrays, one from each device, which the caller then adds up in order.
 
-    This is the one place that chooses how sums of gradients travel. In one process on CPUs the rows are
-    brought to the first device by plain copies. Several processes on CPUs add their own rows up, and a
-    program of its own gathers one vector from each. On accelerators XLA adds the rows of all devices of all
-    processes, and there is one row left.
+    This is the one place that decides how sums of gradients are exchanged. With one process on CPUs, the
+    rows are copied to the first device. With several processes on CPUs, each adds up its own rows, and a
+    separate program gathers one vector from each. On accelerators XLA adds the rows of all devices of all
+    processes, and a single row remains.
 
     Args:
-      mesh: devices of this process; of the other processes, as many take part.
+      mesh: the devices of this process; the same number takes part from each other process.
     """
 
     def __init__(self, mesh: Mesh) -> None:
@@ -212,7 +214,7 @@ class Adding:
         self._split_up: Any = None
 
     def __call__(self, tree: Any) -> list[Any]:
-        """The rows, or what is left of them, each on the first device of this process."""
+        """The rows (or partial sums of them), each on the first device of this process."""
         if self._copies:
             return gather_rows(self._mesh, tree)
         if self._split_up is None:
@@ -223,7 +225,7 @@ class Adding:
 
 
 def _splitting(tree: Any) -> Any:
-    """A jitted function that makes records like the rows of ``tree`` of the rows of a matrix."""
+    """A jitted function that turns the rows of a matrix into pytrees like the rows of ``tree``."""
     blank = jax.tree.map(lambda leaf: np.zeros((1, *leaf.shape[1:]), leaf.dtype), tree)
     restore = ravel_pytree(blank)[1]
     return jax.jit(lambda matrix: [restore(row) for row in matrix])
@@ -231,12 +233,12 @@ def _splitting(tree: Any) -> Any:
 
 @jax.jit
 def _added(rows: list[Any]) -> Float[Array, "N"]:
-    """Rows added in their order, as one vector."""
+    """The sum of rows, added in order, as one vector."""
     return ravel_pytree(jax.tree.map(lambda *of_devices: sum(of_devices), *rows))[0]
 
 
 def _with_others(mesh: Mesh) -> Mesh:
-    """The mesh, with as many devices of each other process that works along."""
+    """The mesh extended by the same number of devices of each other process."""
     if processes.count() == 1:
         return mesh
     found: list[Any] = []
@@ -249,7 +251,7 @@ def _with_others(mesh: Mesh) -> Mesh:
 def sum_by_collective(mesh: Mesh, whole: Mesh, tree: Any) -> Float[Array, "N"]:
     """The sum of the rows on all devices of ``whole``, as one vector on the first device of ``mesh``.
 
-    ``mesh`` has this process's own devices among them.
+    ``mesh`` holds those devices of ``whole`` that belong to this process.
     """
     check_collective(whole)
     vectors = _vectors(mesh)(tree)
@@ -262,7 +264,7 @@ def sum_by_collective(mesh: Mesh, whole: Mesh, tree: Any) -> Float[Array, "N"]:
 
 
 def check_collective(mesh: Mesh) -> None:
-    """Fail where a collective would be between CPU devices of one process, which may stop for good."""
+    """Raise an error if a collective would run between CPU devices of one process, which may deadlock."""
     owners = [device.process_index for device in mesh.devices.flat]
     on_cpus = mesh.devices.flat[0].platform == "cpu"
     assert not (on_cpus and len(set(owners)) < len(owners)), mesh
@@ -270,7 +272,7 @@ def check_collective(mesh: Mesh) -> None:
 
 @cache
 def _vectors(mesh: Mesh) -> Any:
-    """Rows of a tree on each device as one vector there."""
+    """A jitted function that flattens the row of a pytree on each device into one vector."""
     return on_devices(mesh, lambda own: ravel_pytree(own)[0][None], [True], True)
 
 
@@ -283,5 +285,5 @@ def _summing(whole: Mesh) -> Any:
 
 
 def largest_divisor(number: int, limit: int) -> int:
-    """The largest number of devices up to ``limit`` that divides a batch of ``number``."""
+    """The largest divisor of ``number`` that is at most ``limit``."""
     return max(n for n in range(1, limit + 1) if number % n == 0)

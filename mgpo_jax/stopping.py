@@ -1,8 +1,8 @@
-"""Searches that end early: as soon as their best choice is judged good enough, they use no more episodes.
+"""Early stopping: a search runs no more episodes once its best choice is judged good enough.
 
-Lanes of one program go on together, so that a search that has ended is a lane whose episodes end before
-their first step (``adaptation.idle_when``). The host decides after each judgement which lanes those are,
-and fills in what their episodes did not find.
+All lanes of a program run together, so the lane of a search that has ended runs episodes that end before
+their first step (``adaptation.idle_when``). After each judgement the host decides which searches have
+ended, and fills in the results that their lanes no longer produce.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ from mgpo_jax.adaptation import AdaptLog, Judged
 
 
 def ended(judged: Sequence[Judged], stop_at: float) -> np.ndarray:
-    """Which lanes [L] have been judged at ``stop_at`` or more."""
+    """Which lanes [L] have ever been judged at a return of ``stop_at`` or more."""
     return np.any([one.return_ >= stop_at for one in judged], axis=0)
 
 
 def filled(
     log: AdaptLog, judged: Judged, stopped: np.ndarray, before: Sequence[tuple[AdaptLog, Judged]]
 ) -> tuple[AdaptLog, Judged]:
-    """A segment in which the lanes that had stopped keep what they had reached.
+    """Fill in the results of stopped lanes in a segment.
 
     Args:
-      log: of the segment, rows of L lanes.
-      judged: the judgement after it.
-      stopped: [L] which searches had ended before it.
-      before: logs and judgements of the segments before, of which the first has a judgement only.
+      log: the log of the segment, rows of L lanes.
+      judged: the judgement after the segment.
+      stopped: which searches had ended before the segment, [L].
+      before: logs and judgements of the earlier segments, of which the first has only a judgement.
 
     Returns:
-      The log, in which the returns of these searches are the best that any of their episodes had (that of
-      the first judgement where there was no episode), and the judgement before.
+      The log and the judgement. In the rows of stopped lanes, returns are the best one of any earlier
+      episode (that of the first judgement if there was no episode), and the judgement is the previous one.
     """
     last = before[-1][1]
     rows = [one.returns.reshape(len(stopped), -1) for one, _ in before]

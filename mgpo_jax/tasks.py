@@ -1,4 +1,4 @@
-"""Task sets: the fixed test tasks of each world, others to choose settings by, and a user's own.
+"""Task sets: the fixed test tasks of each world, validation tasks, and a user's own tasks.
 
 A set of N tasks is one pytree whose leaves are stacked on a leading axis.
 """
@@ -22,14 +22,15 @@ from mgpo_jax.files import write_arrays
 from mgpo_jax.released import released_folder
 from mgpo_jax.trees import named_leaves
 
-# Streams of task seeds that never meet: test, evaluation while training; data seeds count from 0.
+# Seeds of disjoint streams of tasks: for tests, and for evaluation during training; data seeds count from
+# 0.
 TEST_SEED, EVAL_SEED = 1_000_003, 1_000_033
 NUM_TASKS: Sizes = {"task": range(1, 100_001)}
-"""How many tasks a file may hold."""
+"""The number of tasks that a file may hold."""
 
 
 def sample_tasks(env: Environment, seed: int, num: int) -> Task:
-    """``num`` random tasks."""
+    """Sample ``num`` random tasks, stacked."""
     return _task_sampler(env)(jax.random.split(jax.random.key(seed), num))
 
 
@@ -39,7 +40,7 @@ def _task_sampler(env: Environment) -> Any:
 
 
 def benchmark_tasks(env: Environment, num: int) -> Task:
-    """``num`` test tasks of a world, all different: the same for everyone, and in no dataset."""
+    """The first ``num`` test tasks of a world, all different. They are fixed, and in no dataset."""
     drawn = sample_tasks(env, TEST_SEED, 2 * num)
     rows = [np.asarray(leaf).reshape(2 * num, -1) for leaf in jax.tree.leaves(drawn)]
     _, first = np.unique(np.concatenate(rows, axis=1), axis=0, return_index=True)
@@ -50,11 +51,12 @@ def benchmark_tasks(env: Environment, num: int) -> Task:
 
 
 def test_tasks(world: World | str) -> Task:
-    """The test tasks of a world, by its record, name or place: the released ones where there are any."""
+    """The test tasks of a world, given its record, name or place; the released ones, if there are any."""
     world = find(world) if isinstance(world, str) else world
     env, released = world.make(), released_folder(world) / "tasks.npz"
     if released.is_file():
-        # They were checked when they were released; whether each can be solved is not computed again.
+        # Released tasks were checked before their release, so whether they can be solved is not computed
+        # again.
         return _assembled(read_arrays(released, task_fields(env), NUM_TASKS), env)
     return benchmark_tasks(env, world.num_test_tasks)
 
@@ -66,14 +68,14 @@ def evaluation_tasks(
     tested: Environment | None = None,
     seed: int = 0,
 ) -> Task:
-    """Tasks to watch a training or to choose settings by: none of them is a test task.
+    """Validation tasks, for evaluation during training and for choosing settings; none is a test task.
 
     Args:
-      env: the world that they are of.
-      num: how many there are.
-      num_test_tasks: how many tasks are kept for test.
-      tested: the world whose test tasks these are, where tasks of ``env`` have its fingerprints [``env``].
-      seed: which of several sets. That of 0 watches trainings; others share no task with it.
+      env: the world of the tasks.
+      num: the number of tasks.
+      num_test_tasks: the number of test tasks, which are excluded.
+      tested: the world of the test tasks, if that is another world with the same fingerprints [``env``].
+      seed: index of one of several sets. Set 0 is used during training; the others share no task with it.
 
     Raises:
       DataError: if the world has too few tasks.
@@ -106,12 +108,12 @@ def task_at(tasks: Task, index: int) -> Task:
 
 
 def task_arrays(tasks: Task) -> dict[str, np.ndarray]:
-    """The arrays of a set of tasks by the names of their fields."""
+    """The arrays of a task set by the names of their fields."""
     return {name: np.asarray(leaf) for name, leaf in named_leaves(tasks, "task").items()}
 
 
 def task_fields(env: Environment) -> dict[str, ArrayField]:
-    """What the arrays of a set of tasks must look like."""
+    """The declarations of the arrays of a task set."""
     example = jax.eval_shape(env.sample_task, jax.random.key(0))
     return {
         name: ArrayField(("task", *like.shape), str(like.dtype))
@@ -128,17 +130,17 @@ MEND = "mend that task or leave it out"
 
 
 def load_tasks(path: Path, env: Environment) -> Task:
-    """Read tasks that ``save_tasks`` wrote, or that were made elsewhere.
+    """Read tasks that were written by ``save_tasks`` or made elsewhere.
 
     Raises:
       UsageError: if there is no such file.
-      DataError: if it cannot be read or holds something that is no task, or one that nobody can solve.
+      DataError: if it cannot be read, or holds an invalid or an unsolvable task.
     """
     path = Path(path)
     if not path.is_file():
         raise UsageError(f"no task file {path}; name an npz file of tasks with --tasks")
     fields = task_fields(env)
-    tasks = _checked(read_arrays(path, fields, NUM_TASKS, _needs(env, fields)), env, path)
+    tasks = _checked(read_arrays(path, fields, NUM_TASKS, _required_arrays(env, fields)), env, path)
     try:
         env.check_solvable(tasks)
     except ValueError as error:
@@ -149,36 +151,35 @@ def load_tasks(path: Path, env: Environment) -> Task:
 def tasks_from(
     arrays: Mapping[str, np.ndarray], env: Environment, where: Path | str, trusted: bool = False
 ) -> Task:
-    """A set of tasks from arrays by the names of their fields.
+    """Make a task set from arrays by the names of their fields.
 
     Args:
       arrays: the arrays.
       env: the world.
-      where: where they come from, for messages.
-      trusted: whether shapes and kinds of numbers are all that has to be checked.
+      where: where the arrays come from, for messages.
+      trusted: whether to check only shapes and kinds of numbers.
 
     Raises:
-      DataError: if an array is missing or holds something that is no task; the message begins with
-        ``where``.
+      DataError: if an array is missing or a task is invalid; the message begins with ``where``.
     """
     fields = task_fields(env)
-    fitted = fitted_arrays(arrays, fields, where, NUM_TASKS, _needs(env, fields))
+    fitted = fitted_arrays(arrays, fields, where, NUM_TASKS, _required_arrays(env, fields))
     return _assembled(fitted, env) if trusted else _checked(fitted, env, where)
 
 
-def _needs(env: Environment, fields: Mapping[str, ArrayField]) -> str:
+def _required_arrays(env: Environment, fields: Mapping[str, ArrayField]) -> str:
     return f"tasks of {env.spec.name} need the arrays {', '.join(fields)}"
 
 
 def _assembled(arrays: Mapping[str, np.ndarray], env: Environment) -> Task:
-    """The arrays of all fields as the world's record."""
+    """Assemble the arrays of all fields into the world's task record."""
     example = jax.eval_shape(env.sample_task, jax.random.key(0))
     leaves = [arrays[name] for name in named_leaves(example, "task")]
     return jax.tree.unflatten(jax.tree.structure(example), leaves)
 
 
 def _checked(arrays: Mapping[str, np.ndarray], env: Environment, where: Path | str) -> Task:
-    """The tasks, after the world has found nothing wrong with them."""
+    """Assemble the tasks and let the world check them."""
     tasks = _assembled(arrays, env)
     try:
         env.check_task(tasks)

@@ -1,9 +1,9 @@
 """Pre-training: behavior cloning with hindsight multi-goal prompts (paper, section 3.1, Eq. 2).
 
-A gradient step is accumulated over parts of a batch (microbatches). Each part holds trajectories of nearly
-equal length, which need little padding, is small enough that its activations stay in cache, and is divided
-among the devices. Every random draw is a function of the seed and the step number, so that a run continued
-from a checkpoint equals one that was never interrupted, bit for bit.
+The gradient of a batch is accumulated over its parts (microbatches). Each part holds trajectories of nearly
+equal length, so that little padding is needed; it is small enough for its activations to stay in cache, and
+is divided among the devices. Every random draw is a function of the seed and the step number, so that a run
+resumed from a checkpoint equals an uninterrupted one bit for bit.
 """
 
 from __future__ import annotations
@@ -53,15 +53,16 @@ from mgpo_jax.transformer import (
     network_config,
 )
 
-# Among the metrics of a step, but no figures: a flag, and how many processes were asked to stop before it.
+# Entries of a step's metrics that are not reported: whether all weights are finite, and how many processes
+# had been asked to stop before the step.
 FINITE, ASKED = "weights_finite", "asked_to_stop"
 HIT = 0.1  # per-dimension tolerance for counting a predicted action as correct
-# Root mean square of a typical AdamW update before the learning rate.
+# Root mean square of a typical AdamW update, before it is scaled by the learning rate.
 ADAMW_RMS = 0.2
 
 
 class TrainState(NamedTuple):
-    """Everything a run carries from one gradient step to the next."""
+    """The state of training between two gradient steps."""
 
     params: Any
     opt_state: Any
@@ -69,15 +70,16 @@ class TrainState(NamedTuple):
 
 
 class Stats(NamedTuple):
-    """Sums over real steps."""
+    """Statistics of predictions, summed over real (not padded) steps."""
 
     nll: Float[Array, "*batch"]
-    """Of the actions."""
+    """Negative log-likelihood of the actions, in nats."""
     correct: Float[Array, "*batch"]
-    """Steps whose likeliest action is the demonstrated (intended) one, within ``HIT`` in each dimension."""
+    """Number of steps at which the most likely action is the demonstrated (intended) one, within ``HIT`` in
+    each dimension."""
     num_steps: Float[Array, "*batch"]
     parts: dict[str, Float[Array, "*batch"]]
-    """Other parts of the loss, by name, for kinds of networks that learn more than actions."""
+    """Other terms of the loss by name, for kinds of networks that learn more than actions."""
 
     @property
     def divisor(self) -> Any:
@@ -86,19 +88,19 @@ class Stats(NamedTuple):
 
     @property
     def means(self) -> dict[str, Any]:
-        """Means over the steps, by the names of metrics."""
+        """Means over the steps, by metric name."""
         sums = {"loss": self.nll, "accuracy": self.correct, **self.parts}
         return {name: total / self.divisor for name, total in sums.items()}
 
 
 def stats_of(distribution: Any, labels: Array, counts: Array, **parts: Array) -> Stats:
-    """The statistics of some action distributions.
+    """The statistics of predicted action distributions.
 
     Args:
-      distribution: of the actions, [*steps].
-      labels: the actions demonstrated (intended), [*steps] or [*steps, A].
+      distribution: the predicted distributions, batched over [*steps].
+      labels: the demonstrated (intended) actions, [*steps] or [*steps, A].
       counts: which steps count, bool [*steps].
-      **parts: other parts of the loss at every step, [*steps].
+      **parts: other terms of the loss at every step, [*steps].
     """
 
     def total(values: Array) -> Array:
@@ -124,14 +126,14 @@ def learning_rate_schedule(config: TrainConfig) -> optax.Schedule:
 def make_optimizer(
     config: TrainConfig, unravel: Callable[[Any], Any]
 ) -> optax.GradientTransformation:
-    """The optimizer, on weights that are one vector.
+    """The optimizer of a training run, for weights that are raveled into one vector.
 
-    Muon (Jordan 2024) makes the update of a matrix orthogonal; its scale is matched to AdamW's (Liu et
-    al. 2025), so that one learning rate serves both.
+    Muon (Jordan 2024) orthogonalizes the update of each matrix. Its updates are scaled to AdamW's root mean
+    square (Liu et al. 2025), so that both optimizers use the same learning rate.
 
     Args:
-      config: settings of the training.
-      unravel: gives the vector's parts their shapes and names, which Muon needs.
+      config: the training config.
+      unravel: restores the pytree of parameters from the vector; Muon needs their shapes and names.
     """
     rate, decay = learning_rate_schedule(config), config.weight_decay
     clip = optax.clip_by_global_norm(config.clip_norm)
@@ -156,7 +158,7 @@ def make_optimizer(
 
 
 def _block_matrices(params: Any) -> Any:
-    """The matrices between hidden layers; embeddings and the head are left to AdamW."""
+    """Mark the matrices of the Transformer blocks for Muon; AdamW updates embeddings, head and the rest."""
 
     def kind(path: Any, leaf: Array) -> Any:
         in_block = any(str(part.key).startswith("blocks") for part in path)
@@ -166,10 +168,11 @@ def _block_matrices(params: Any) -> Any:
 
 
 def blurred(key: PRNGKeyArray, trajectory: Trajectory, largest: float) -> Trajectory:
-    """The trajectory seen through noise of one size, uniform in [0, ``largest``].
+    """The trajectory with Gaussian noise on its observations.
 
-    A policy that saw only exact observations trusts their last digits; one that saw a single size of
-    noise does less well without any.
+    The standard deviation is drawn once per trajectory, uniformly from [0, ``largest``]. A policy trained
+    on exact observations alone relies on their last digits; one trained with a single noise level does
+    worse on exact observations.
     """
     key_size, key_noise = jax.random.split(key)
     size = largest * jax.random.uniform(key_size)
@@ -188,15 +191,16 @@ def bc_loss(
 ) -> tuple[Float[Array, ""], Stats]:
     """-sum_t log pi(a_t | p, h_{t-1}, o_t) of one trajectory, with p ~ P(p | tau) (Eq. 2).
 
-    The history h holds the executed actions. Where the demonstrator told what it intended, a_t is that.
+    The history h holds the executed actions. The target a_t is the action that the demonstrator intended,
+    if the dataset has it, and otherwise the executed one.
 
     Args:
-      params: weights of the network.
+      params: the network's parameters.
       key: random key.
       network: the policy's network.
-      trajectory: a demonstration, arrays of T steps.
-      deterministic: no dropout and no noise.
-      obs_noise: as in ``TrainConfig`` (static; not in the paper).
+      trajectory: a demonstration, padded to T steps.
+      deterministic: whether to disable dropout and noise.
+      obs_noise: largest noise on observations, see ``TrainConfig`` (static; not in the paper).
     """
     key_prompt, key_dropout, key_noise = jax.random.split(key, 3)
     if obs_noise and not deterministic:
@@ -225,7 +229,7 @@ def batch_loss(
     network: NetworkConfig,
     obs_noise: float,
 ) -> tuple[Float[Array, ""], Stats]:
-    """The loss and statistics of several trajectories, summed."""
+    """The loss and statistics of a part of a batch, summed over its B trajectories."""
 
     def one(key: PRNGKeyArray, trajectory: Trajectory) -> tuple[Array, Stats]:
         return learned.loss(params, key, network, trajectory, deterministic, obs_noise)
@@ -235,7 +239,7 @@ def batch_loss(
 
 
 def initial_params(key: PRNGKeyArray, config: TransformerConfig) -> Any:
-    """Random weights of a multi-goal policy."""
+    """Randomly initialized parameters of a multi-goal policy."""
     prompt = single_goal(jnp.zeros(config.goal_dim), config.max_prompt_length)
     return GoalTransformer(config).init(key, prompt, *config.blank_episode())
 
@@ -247,7 +251,7 @@ def _prompted_loss(
 
 
 def transformer_told(config: TransformerConfig) -> str:
-    """The sizes of a Transformer in words."""
+    """The sizes of a Transformer as text."""
     return f"{config.num_layers} layers, width {config.embed_dim}, {config.num_heads} head(s)"
 
 
@@ -267,10 +271,10 @@ def _flatten(params: Any) -> Array:
 
 
 class _Accumulator:
-    """Sums gradients and statistics over the parts of a batch, a row for each device.
+    """Sums gradients and statistics over the parts of a batch, in one row for each device.
 
-    Weights and gradients travel between devices as one vector: a handful of passes over memory instead of
-    a handful for each of some fifty small arrays.
+    Weights and gradients are passed between devices as one vector, which takes a few passes over memory
+    instead of a few for each of some fifty small arrays.
     """
 
     def __init__(
@@ -308,9 +312,9 @@ class _Accumulator:
     def sums(
         self, weights: Array, parts: Iterator[tuple[Any, Trajectory]], asked: int
     ) -> list[Any]:
-        """Rows of ``(gradient vector, Stats)`` to be added up, over ``(keys, part)`` pairs.
+        """Sums of ``(gradient vector, Stats)`` over ``(keys, part)`` pairs, in rows to be added up.
 
-        Where several processes train together, also whether this one is asked to stop.
+        If several processes train together, the rows also hold whether this one has been asked to stop.
         """
         params, sums = self.unpack(replicate(self.mesh, weights)), self.zeros()
         for keys, part in parts:
@@ -324,7 +328,7 @@ class _Accumulator:
 def _make_update(
     optimizer: optax.GradientTransformation, unravel: Callable[[Any], Any]
 ) -> Callable[[Any, Any, list[Any]], tuple[Any, Any, dict[str, Array]]]:
-    """``(params, opt_state, rows of sums) -> (params, opt_state, metrics)``."""
+    """The jitted update: ``(params, opt_state, rows of sums) -> (params, opt_state, metrics)``."""
 
     @partial(jax.jit, donate_argnums=(0, 1))
     def update(params: Any, opt_state: Any, rows: list[Any]) -> tuple[Any, Any, dict[str, Array]]:
@@ -346,18 +350,18 @@ def _make_update(
 
 
 class Trainer:
-    """The compiled pieces of a training run on one dataset.
+    """Trains a network on one dataset; holds the jitted functions, while ``TrainState`` holds the state.
 
     Args:
-      config: how to train.
-      network_config: the network.
+      config: the training config.
+      network_config: the network's config.
       dataset: the trajectories to learn from.
-      mesh: the devices of this process to divide the parts of a batch among. Where several processes work
-        together, each computes its own share of every part, and all of them take the same step.
+      mesh: the devices of this process, among which each part of a batch is divided. If several processes
+        train together, each computes its own share of every part, and all of them take the same step.
 
     Raises:
-      UsageError: if the devices do not divide ``config.part_size``, a setting is out of its bounds, or
-        noise is asked for on observations that are integers.
+      UsageError: if ``config.part_size`` is not divisible by the number of devices, a setting is out of
+        bounds, or noise is requested for integer observations.
     """
 
     def __init__(
@@ -409,11 +413,12 @@ class Trainer:
         self._part_keys, self._part_stats = part_keys, part_stats
 
     def init(self, params: Any = None) -> TrainState:
-        """The state before the first step, with given weights of the network or with random ones."""
-        # A GPU would compile 160 small programs one after the other, so it gets two large ones. They round
-        # differently: on CPUs, where the published policies were trained, the small ones are kept.
+        """The state before the first step, with the given parameters or with random ones (default)."""
+        # On a GPU two large programs compile faster than the 160 small ones of eager execution. The two
+        # ways round differently, so CPUs, on which the published policies were trained, stay with the eager
+        # one.
         compiled = (lambda function: function) if jax.default_backend() == "cpu" else jax.jit
-        # Given weights are copied, since the first step gives the memory of its weights away.
+        # Given parameters are copied, since the first step donates the buffers of its parameters.
         make = compiled(self._initial_params)
         params = make() if params is None else jax.tree.map(jnp.array, params)
         return TrainState(params, compiled(self._optimizer.init)(self._flatten(params)), 0)
@@ -421,10 +426,11 @@ class Trainer:
     def step(
         self, state: TrainState, plans: list[BatchPlan], asked: int = 0
     ) -> tuple[TrainState, dict[str, Array]]:
-        """One gradient step on the parts of a batch, and its metrics.
+        """Take one gradient step on the parts of a batch; returns the new state and metrics.
 
-        ``asked`` says whether this process is asked to stop. Where several work together, the metrics of
-        all of them say how many are (``ASKED``), so that they can stop after the same step.
+        ``asked`` says whether this process has been asked to stop. If several processes train together, the
+        metrics of each hold how many of them have been asked (``ASKED``), so that all stop after the same
+        step.
         """
         parts = (
             (
@@ -440,9 +446,9 @@ class Trainer:
     def evaluate(
         self, params: Any, plans: list[BatchPlan], dataset: Dataset | None = None
     ) -> dict[str, float]:
-        """Mean loss and accuracy of some weights, without dropout and noise.
+        """Mean loss and accuracy of parameters, without dropout and noise.
 
-        ``dataset`` is what the plans are of (default: the one that is trained on).
+        ``dataset`` is the dataset that the plans index (default: the training data).
         """
         rows = self._dataset if dataset is None else dataset
         stats = [self._part_stats(params, self._key_eval, rows.gather(*plan)) for plan in plans]
@@ -451,19 +457,19 @@ class Trainer:
 
 
 def _own_share(num: int) -> slice:
-    """Which of ``num`` trajectories of a part this process computes."""
+    """The share of a part's ``num`` trajectories that this process computes."""
     own = num // processes.count()
     return slice(processes.index() * own, (processes.index() + 1) * own)
 
 
 def _own_part(plan: BatchPlan) -> BatchPlan:
-    """What this process computes of a part of a batch."""
+    """The share of a part of a batch that this process computes."""
     own = _own_share(len(plan.lengths))
     return BatchPlan(plan.indices[own], plan.lengths[own], plan.num_steps)
 
 
 def finite_metrics(step: int, metrics: Mapping[str, Any]) -> dict[str, Any]:
-    """The figures of a gradient step, numpy scalars.
+    """The reported metrics of a gradient step, as numpy scalars.
 
     Raises:
       DataError: if one of them, or a weight after the step, is not finite.
@@ -480,7 +486,7 @@ def finite_metrics(step: int, metrics: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def diverged(step: int, metric: str, value: Any) -> DataError:
-    """The error for a training in which a metric is not finite after a step."""
+    """The error for a training run in which a metric became NaN or infinite."""
     return DataError(
         f"training stopped at step {step}: {metric} became {value}; start a new run with a lower learning "
         "rate or a lower clip norm"
@@ -490,7 +496,10 @@ def diverged(step: int, metric: str, value: Any) -> DataError:
 def batch_stream(
     config: TrainConfig, dataset: Dataset, truncate: bool, num_devices: int = 1, first_step: int = 0
 ) -> Iterator[list[BatchPlan]]:
-    """The batches of a run from ``first_step`` on; ``num_devices`` of all processes divide each part."""
+    """The batches of a run from ``first_step`` on.
+
+    ``num_devices`` is the number of devices of all processes, among which each part is divided.
+    """
     return plan_batches(
         dataset,
         seed=config.seed,
@@ -507,19 +516,19 @@ def batch_stream(
 def continued_network(
     config: TransformerConfig, changes: Mapping[str, Any], where: str
 ) -> TransformerConfig:
-    """The network of a training that starts from the weights of another one.
+    """The network config of a training run that starts from the parameters of another network.
 
     Args:
-      config: the network of the weights.
-      changes: settings by name; all but ``dropout`` (default: that of the recipe) must be as they are.
-      where: whose weights they are, for messages.
+      config: the config of the other network.
+      changes: settings by name. Only ``dropout`` (default: the recipe's) may differ from ``config``.
+      where: whose parameters they are, for messages.
 
     Raises:
-      UsageError: if a setting contradicts the weights.
+      UsageError: if a setting contradicts the parameters.
     """
     dropout = changes.get("dropout", RECIPE_NETWORK["dropout"])
     others = {name: value for name, value in changes.items() if name != "dropout"}
-    replace(config, **others)  # complains about a name that is none
+    replace(config, **others)  # raises TypeError for an unknown name
     check_contradictions(others, {name: getattr(config, name) for name in others}, where)
     return replace(config, dropout=dropout)
 
@@ -531,24 +540,24 @@ def pretrain(
     init: LoadedPolicy | None = None,
     **network: Any,
 ) -> LoadedPolicy:
-    """Pre-train a policy on a dataset, in memory and from the first step to the last.
+    """Pre-train a policy on a dataset, in memory and without interruption.
 
-    ``experiments.pretrain`` does the same with a recipe for each world, and with checkpoints, evaluations
-    and metrics on the way.
+    The command ``experiments.pretrain`` does the same with a recipe for each world, and writes checkpoints,
+    evaluations and metrics along the way.
 
     Args:
       dataset: trajectories of the world.
-      spec: the world's facts.
-      config: how to train (default: that of ``TrainConfig``).
-      init: a policy whose network and weights training starts from (default: random weights). Only
-        ``dropout`` can be another one then.
-      **network: sizes and options of the network, as in ``TransformerConfig``, that differ from the
-        recipe's (``settings.RECIPE_NETWORK``: no dropout and four heads).
+      spec: the world's specification.
+      config: the training config (default: ``TrainConfig()``).
+      init: a policy whose network and parameters training starts from (default: random parameters). Then
+        only ``dropout`` may be changed.
+      **network: fields of ``TransformerConfig`` that differ from the recipe
+        (``settings.RECIPE_NETWORK``: no dropout and four heads).
 
     Raises:
-      DataError: if the dataset or ``init`` does not fit the world, or a loss or weight is not finite any
-        more.
-      UsageError: if a setting is out of its bounds, or contradicts ``init``.
+      DataError: if the dataset or ``init`` does not fit the world, or a loss or weight becomes NaN or
+        infinite.
+      UsageError: if a setting is out of bounds or contradicts ``init``.
     """
     config = config or TrainConfig()
     check_dataset(dataset, "dataset", spec)
@@ -567,7 +576,7 @@ def pretrain(
     with Progress(config.steps, "step") as progress:
         while state.step < config.steps:
             state, metrics = trainer.step(state, next(batches))
-            finite_metrics(state.step - 1, before)  # computed by now, so nothing waits for it
+            finite_metrics(state.step - 1, before)  # one step late, so that nothing waits for it
             before = metrics
             progress.update()
     finite_metrics(state.step, before)

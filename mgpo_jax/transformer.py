@@ -1,16 +1,16 @@
 """The multi-goal causal Transformer (paper, section 3.1, appendix D, Table 6).
 
-One sequence is ``(g_1 .. g_P, o_1, a_1, o_2, a_2, .., o_T)``: goals, observations and actions enter
-through three linear layers, observations and actions of one step share a learned timestep embedding,
-and the outputs at the observations are the action distributions. With one token a step
-(``tokens_per_step=1``) the sequence is ``(g_1 .. g_P, s_1, .., s_T)``, where s_t is the sum of what
-embeds a_{t-1}, o_t and the timestep: half as many tokens, which know the same. The module is written for
-one sequence and has three entries that share their layers: the full pass (training), and ``prefill`` /
-``decode`` with an explicit key-value cache (acting).
+The input sequence is ``(g_1 .. g_P, o_1, a_1, o_2, a_2, .., o_T)``. Goals, observations and actions are
+embedded by three linear layers, the observation and the action of one step share a learned timestep
+embedding, and the outputs at the observations parameterize the action distributions. With one token per
+step (``tokens_per_step=1``) the sequence is ``(g_1 .. g_P, s_1, .., s_T)``, where s_t is the sum of the
+embeddings of a_{t-1}, o_t and the timestep: half as many tokens carry the same information. The module is
+written for one sequence and has three entry points that share their layers: the full pass (for training),
+and ``prefill`` / ``decode`` with an explicit key-value cache (for acting).
 
-Two deliberate differences from the authors' code: prompt slots get a learned position embedding
-(``prompt_order=True``; theirs reach the network without any, so that their order is visible through
-the causal mask alone), and all tokens pass the input LayerNorm (theirs: all but the goals).
+The network deliberately differs from the authors' code in two points. Prompt slots have a learned position
+embedding (``prompt_order=True``; theirs have none, so the order of goals shows only through the causal
+mask), and all tokens pass through the input LayerNorm (theirs: all but the goals).
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from mgpo_jax.prompts import Prompt
 from mgpo_jax.schema import STRICT
 from mgpo_jax.settings import ENCODERS, NumGoals, NumLayers, Share, TokensPerStep, Width
 
-# Attention over the keys of one query block at a time: never the full score matrix.
+# Attention is computed for blocks of this many queries, so the full score matrix is never in memory.
 QUERY_BLOCK = 128
-OBS_LIMIT = 5.0  # standard deviations; an observation farther out counts as this far
+OBS_LIMIT = 5.0  # standardized observations are clipped to this many standard deviations
 
 
 Size = Annotated[int, Ge(1), Le(1_000_000)]
@@ -44,7 +44,7 @@ Size = Annotated[int, Ge(1), Le(1_000_000)]
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """What every network is told of its world, and how it reads observations and gives actions."""
+    """The config that all networks share: the shapes of the world, the encoder and the action head."""
 
     __pydantic_config__ = STRICT
 
@@ -63,15 +63,15 @@ class NetworkConfig:
     head: str = "categorical"
     """The action distribution, one of ``distributions.HEADS``."""
     obs_mean: tuple[Annotated[float, Ge(-1e18), Le(1e18)], ...] = ()
-    """Mean of every component of an observation in training, in the order of the flattened observation,
-    where observations are standardized (empty: they are not)."""
+    """Mean over the training data of every component of the flattened observation (empty: observations are
+    not standardized)."""
     obs_std: tuple[Annotated[float, Gt(0), Le(1e18)], ...] = ()
-    """Standard deviation of every component, likewise."""
+    """Standard deviation of every component, in the same order."""
     obs_layout: ObsLayout | None = None
-    """What the numbers of an observation are, for the encoders that use it."""
+    """The meaning of an observation's components, for encoders that use it."""
 
     def standardized(self, obs: Shaped[Array, "..."]) -> Shaped[Array, "..."]:
-        """Observations ``[*batch, ...]`` as the encoder takes them."""
+        """Observations ``[*batch, ...]`` standardized and clipped, as the encoder expects them."""
         if not self.obs_mean:
             return obs
         mean, std = (
@@ -80,18 +80,18 @@ class NetworkConfig:
         return jnp.clip((obs - mean) / std, -OBS_LIMIT, OBS_LIMIT)
 
     def make_encoder(self, width: int) -> nn.Module:
-        """The module that turns observations into tokens of a width."""
+        """The module that embeds observations as tokens of the given width."""
         make = ENCODERS.find(self.encoder).make
         module: nn.Module = make(self.obs_shape, width, self.obs_layout)
         return module
 
     def action_numbers(self, actions: Array) -> Float[Array, "... A"]:
-        """Actions as numbers that a layer takes: one-hot where they are discrete."""
+        """Actions as input features: one-hot if they are discrete, unchanged if continuous."""
         discrete = self.head == "categorical"
         return jax.nn.one_hot(actions, self.action_dim) if discrete else actions
 
     def blank_episode(self, num_steps: int = 1) -> tuple[Array, Array]:
-        """Observations and actions of the right shapes and dtypes, all zeros."""
+        """All-zero observations and actions of an episode, with the right shapes and dtypes."""
         discrete = self.head == "categorical"
         actions = (num_steps,) if discrete else (num_steps, self.action_dim)
         obs = jnp.zeros((num_steps, *self.obs_shape), self.obs_dtype)
@@ -100,7 +100,7 @@ class NetworkConfig:
 
 @dataclass(frozen=True)
 class TransformerConfig(NetworkConfig):
-    """Sizes of the network. Defaults are Table 6 of the paper."""
+    """Config of the multi-goal Transformer. The defaults are those of Table 6 in the paper."""
 
     __pydantic_config__ = STRICT
 
@@ -110,32 +110,37 @@ class TransformerConfig(NetworkConfig):
     num_layers: NumLayers = 3
     num_heads: Width = 1
     dropout: Share = 0.1
-    """Rate on embeddings, attention weights and residual branches."""
+    """Dropout rate on embeddings, attention weights and residual branches."""
     prompt_order: bool = True
-    """Whether prompt slots carry a position embedding (the paper's network: False)."""
+    """Whether prompt slots have a position embedding (the paper's network: False)."""
     tokens_per_step: TokensPerStep = 2
-    """An observation and an action as two tokens, or the last action and the observation as one."""
+    """2: observation and action are separate tokens; 1: the last action and the observation share one."""
 
     def num_step_tokens(self, num_steps: int | Int[Array, ""]) -> Any:
-        """The number of tokens of some steps, up to the last observation."""
+        """The number of tokens of an episode with ``num_steps`` steps, up to the last observation."""
         return self.tokens_per_step * num_steps - (self.tokens_per_step - 1)
 
 
 def network_config(spec: EnvSpec, head: str | None = None, **sizes: Any) -> TransformerConfig:
-    """The network for a world, with Table 6's sizes unless given others.
+    """The network config for a world, with the sizes of Table 6 except for those given.
 
     Raises:
-      UsageError: as ``world_side``.
+      UsageError: see ``world_side``.
     """
     return TransformerConfig(**world_side(spec, head, sizes.get("encoder", "linear")), **sizes)
 
 
 def world_side(spec: EnvSpec, head: str | None, encoder: str) -> dict[str, Any]:
-    """What a network's config says of its world, by the names of its fields (without ``encoder``).
+    """The fields of a network config that follow from its world, by name (without ``encoder``).
+
+    Args:
+      spec: the world's specification.
+      head: the action distribution (default: the first one in ``distributions.HEADS`` that fits).
+      encoder: the encoder of observations.
 
     Raises:
-      UsageError: if there is no such head or encoder, the head is not one for the world's actions, or the
-        encoder not one for its observations.
+      UsageError: if the head or the encoder does not exist, the head does not fit the world's actions, or
+        the encoder does not fit its observations.
     """
     known = [name for name in HEADS if (name == "categorical") == spec.discrete]
     head = head or known[0]
@@ -170,7 +175,7 @@ def _layout_for(encoder: Encoder, spec: EnvSpec) -> ObsLayout | None:
 
 
 class KVCache(NamedTuple):
-    """Keys and values of the tokens seen so far, for each layer; ``step`` is the next timestep."""
+    """Keys and values of the tokens read so far, for each layer; ``step`` is the next timestep."""
 
     keys: tuple[Float[Array, "*batch H S E"], ...]
     values: tuple[Float[Array, "*batch H S E"], ...]
@@ -179,7 +184,7 @@ class KVCache(NamedTuple):
 
 
 def grow_cache(cache: KVCache, num_tokens: int) -> KVCache:
-    """The same cache with room for ``num_tokens`` more. The cost of attention grows with that room."""
+    """The cache padded with room for ``num_tokens`` more. Attention pays for the unused room, too."""
     pad = ((0, 0), (0, num_tokens), (0, 0))
     keys, values = jax.tree.map(lambda rows: jnp.pad(rows, pad), (cache.keys, cache.values))
     return cache._replace(keys=keys, values=values)
@@ -208,7 +213,7 @@ class Block(nn.Module):
     def __call__(
         self, x: Float[Array, "S E"], rows: slice | np.ndarray, attend: Attend, deterministic: bool
     ) -> Float[Array, "R E"]:
-        """Transform the tokens ``x[rows]``, which attend to keys and values of all of ``x``."""
+        """Transform the R tokens ``x[rows]``, which attend to the keys and values of all of ``x``."""
         h = self.norm_attention(x)
         heads = (-1, self.config.num_heads, self.config.embed_dim // self.config.num_heads)
         query = self.query(h[rows]).reshape(heads)
@@ -237,15 +242,17 @@ def _attention_by_row(
     value: Float[Array, "H S E"],
     visible: Bool[Array, "R S"],
 ) -> Float[Array, "R HE"]:
-    """The same for a few queries: matrix-vector products, which XLA's CPU backend runs several
-    times faster than products with a matrix of two rows."""
+    """``_attention`` for a few queries, as matrix-vector products.
+
+    XLA's CPU backend runs these several times faster than a product with a two-row matrix.
+    """
 
     def of_head(query: Array, key: Array, value: Array, visible: Array) -> Array:
         scores = (key @ query) * query.shape[-1] ** -0.5
         return jax.nn.softmax(jnp.where(visible, scores, -1e9)) @ value
 
     heads = jax.vmap(of_head, in_axes=(0, 0, 0, None))
-    if len(query) > 2:  # a prompt: one copy of the code for all of its rows
+    if len(query) > 2:  # in prefill: a loop, compiled once for all rows
         return jax.lax.map(lambda row: heads(row[0], key, value, row[1]).ravel(), (query, visible))
     rows = [heads(q, key, value, v).ravel() for q, v in zip(query, visible, strict=True)]
     return jnp.stack(rows)
@@ -292,18 +299,18 @@ class GoalTransformer(nn.Module):
         actions: Array,
         deterministic: bool = True,
     ) -> Float[Array, "R E"]:
-        """What the last layer reads: R = T rows, one for each observation, if there are any blocks."""
+        """The input of the action head: R = T rows, one for each observation, if there are any blocks."""
         num_slots, stride = self.config.max_prompt_length, self.config.tokens_per_step
         steps = self._step_tokens(obs, actions, self.embed_time[: len(obs)])
         x = jnp.concatenate([self._prompt_tokens(prompt), steps])
-        # Only observations are read out, so the last layer computes nothing else.
+        # Only the outputs at observations are used, so the last layer computes no others.
         reads = slice(num_slots, None, stride)
         return self._full_pass(
             x, self._seen(prompt, len(steps)), range(len(x)), reads, deterministic
         )
 
     def _seen(self, prompt: Prompt, num_tokens: int) -> Bool[Array, "S"]:
-        """Which tokens of the prompt and of the steps after it there are."""
+        """Which tokens may be attended to: all but the empty prompt slots."""
         return jnp.concatenate([prompt.mask, jnp.ones(num_tokens, bool)])
 
     def _full_pass(
@@ -317,11 +324,11 @@ class GoalTransformer(nn.Module):
         """Run all tokens at once.
 
         Args:
-          x: embeddings of the tokens. The first S of them can be attended to, the others only read.
-          seen: which of the first S there are.
-          at: positions of all tokens: each sees those of the first S up to its own.
-          reads: the tokens whose outputs are wanted.
-          deterministic: no dropout.
+          x: embeddings of N tokens. The first S of them can be attended to; the others only attend.
+          seen: which of the first S tokens are real, rather than empty prompt slots.
+          at: positions of all N tokens: each attends to those of the first S up to its own position.
+          reads: the R tokens whose outputs are wanted.
+          deterministic: whether to disable dropout.
         """
         x = self.dropout(self.norm_in(x), deterministic=deterministic)
         positions = jnp.arange(len(seen))
@@ -337,7 +344,7 @@ class GoalTransformer(nn.Module):
                 mixed = []
                 for start in range(0, len(at), QUERY_BLOCK):
                     block_at = at[start : start + QUERY_BLOCK]
-                    end = max(block_at) + 1  # later keys are hidden by causality
+                    end = max(block_at) + 1  # the causal mask hides all later keys
                     visible = seen[None, :end] & (
                         positions[None, :end] <= jnp.asarray(block_at)[:, None]
                     )
@@ -393,10 +400,11 @@ class GoalTransformer(nn.Module):
     def _extend(
         self, x: Float[Array, "R E"], cache: KVCache, at: int | Int[Array, ""], keeps: bool = True
     ) -> tuple[Float[Array, "1 E"], KVCache]:
-        """Run new tokens, the first of them at position ``at``, against the cache.
+        """Run R new tokens, the first of them at position ``at``, against the cache.
 
-        Returns the features of the last one, and the cache with all of them. Without ``keeps`` they only
-        read what is there up to their position, and the cache stays as it is.
+        Returns the features of the last token, and the cache with the new tokens appended. With
+        ``keeps=False`` the tokens only attend to cached ones up to their position, and the cache is
+        unchanged.
         """
         num_new = len(x)
         capacity = cache.keys[0].shape[1]
@@ -449,12 +457,12 @@ class GoalTransformer(nn.Module):
     def _step_tokens(
         self, obs: Shaped[Array, "T ..."], actions: Array, time: Float[Array, "T E"]
     ) -> Float[Array, "S E"]:
-        """The tokens of T steps, up to the last observation."""
+        """The S tokens of T steps, up to the last observation."""
         if self.config.tokens_per_step == 1:
-            before = self._embedded(actions)[:-1]  # nothing was done before the first observation
+            before = self._embedded(actions)[:-1]  # no action comes before the first observation
             return self._obs_token(obs, time) + jnp.pad(before, ((1, 0), (0, 0)))
         pairs = jnp.stack([self._obs_token(obs, time), self._action_token(actions, time)], axis=1)
-        return pairs.reshape(2 * len(obs), -1)[:-1]  # nothing follows the last action
+        return pairs.reshape(2 * len(obs), -1)[:-1]  # the last action predicts nothing
 
     def read_out(self, x: Float[Array, "*R E"]) -> Distribution:
         """Action distributions from ``features``."""

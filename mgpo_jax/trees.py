@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Int
 
 
 def choose(condition: Bool[Array, ""], if_true: Any, if_false: Any) -> Any:
-    """``if_true`` or ``if_false``, two pytrees of the same shapes."""
+    """Select ``if_true`` or ``if_false``, two pytrees of the same structure and shapes."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), if_true, if_false)
 
 
@@ -24,9 +24,9 @@ def put_row(rows: Any, row: Any, index: Int[Array, ""]) -> Any:
 
 
 def named_leaves(tree: Any, lone: str) -> dict[str, Any]:
-    """The leaves of a pytree by their path, such as ``prompt.goals``.
+    """The leaves of a pytree by path, such as ``prompt.goals``.
 
-    A tree that is a leaf itself has the name ``lone``.
+    If the tree is a single leaf, its name is ``lone``.
     """
     paths, _ = jax.tree_util.tree_flatten_with_path(tree)
     return {
@@ -35,14 +35,14 @@ def named_leaves(tree: Any, lone: str) -> dict[str, Any]:
 
 
 def numbered_leaves(tree: Any) -> dict[str, np.ndarray]:
-    """The leaves of a pytree by their place in it, to be written to a file."""
+    """The leaves of a pytree by their index, to be written to a file."""
     return {f"leaf{i:05}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(tree))}
 
 
 def with_leaves(like: Any, leaves: Mapping[str, np.ndarray]) -> Any:
-    """A pytree of the structure of ``like`` from its ``numbered_leaves``.
+    """Rebuild a pytree with the structure of ``like`` from its ``numbered_leaves``.
 
     Raises:
-      ValueError: if there are more or fewer of them.
+      ValueError: if there are more or fewer leaves.
     """
     return jax.tree.unflatten(jax.tree.structure(like), [leaves[name] for name in sorted(leaves)])

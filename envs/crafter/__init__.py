@@ -29,12 +29,12 @@ HORIZON = 500
 
 
 def make(name: str = "crafter-symbolic", places: bool = False) -> Crafter:
-    """Crafter. With ``places``, goals say where their achievements were unlocked.
+    """The environment of Crafter. With ``places``, goals include where their achievements were unlocked.
 
     Raises:
       MissingExtraError: if craftax is missing or too old.
     """
-    check_extra()  # complains now and not in the middle of a program
+    check_extra()  # raises errors now rather than while a program is traced
     from envs.crafter.env import Crafter
 
     return Crafter(name=name, horizon=HORIZON, places=places)
@@ -67,7 +67,7 @@ def load_page(env: Crafter) -> Page:
 
 
 def make_encoder(obs_shape: tuple[int, ...], width: int, layout: ObsLayout | None) -> Module:
-    """The linear layer on Crafter's picture of the codes.
+    """The encoder that is a linear layer on Crafter's picture, computed from the codes.
 
     Raises:
       MissingExtraError: if Crafter's textures are missing.
@@ -79,7 +79,7 @@ def make_encoder(obs_shape: tuple[int, ...], width: int, layout: ObsLayout | Non
 
 
 def encoder_fault(layout: ObsLayout, shape: tuple[int, ...]) -> str | None:
-    """What is wrong with observations that are to be Crafter's codes and nothing else."""
+    """What is wrong with observations that must be exactly Crafter's codes; None if nothing is."""
     check_extra()
     from envs.crafter.view import LAYOUT, OBS_SIZE
 
@@ -93,7 +93,7 @@ def encoder_fault(layout: ObsLayout, shape: tuple[int, ...]) -> str | None:
 PICTURE = Encoder(name="crafter-picture", make=make_encoder, uses_layout=True, fault=encoder_fault)
 
 PRESETS = {
-    # As many goals as there are achievements, and the task goal.
+    # Prompts have room for one goal per achievement, and the task goal.
     "fast": {
         "steps": 8_000,
         "trajectories": 12_000,
@@ -115,10 +115,10 @@ CRAFTER_SYMBOLIC = World(
     presets={name: {**preset, "encoder": "cells"} for name, preset in PRESETS.items()},
     pictures=load_pictures,
     page=load_page,
-    # Greedy actions repeat themselves and get stuck. Returns vary with what mobs do.
+    # Greedy policies repeat themselves and get stuck. Returns vary with what the mobs do.
     judged=Judgement(mode="sample", temperature=1.0, episodes=16),
-    # About the standard deviation of the returns of one prompt. The default unit, the range of all returns
-    # (22.9), would explore seven times as much.
+    # Approximately the standard deviation of the returns of one prompt. With the default unit, the range of
+    # all returns (22.9), exploration would be seven times as strong.
     method_defaults={"ucb": {"scale": 3.0}},
 )
 
@@ -134,6 +134,6 @@ CRAFTER = replace(
     name="crafter",
     make=make_seen,
     summary="crafter-symbolic for policies that see Crafter's picture of 64 x 64 pixels",
-    # What is recorded is what the picture is drawn from; the encoder makes the picture of it.
+    # Datasets hold the codes from which the picture is drawn; the encoder computes with the picture.
     presets={name: {**preset, "encoder": "crafter-picture"} for name, preset in PRESETS.items()},
 )

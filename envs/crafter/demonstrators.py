@@ -1,10 +1,10 @@
 """The demonstrators of Crafter: scripts that know the recipes and explore the map.
 
-The paper's data came from trained policies (Achievement Distillation), which cannot be had here. A
-demonstrator draws an order of achievements for each episode and leaves some of them out, so that prompts
-differ; ``envs.crafter.planning`` chooses its actions. It knows only what has been in view in this episode,
-as it was when last in view. Now and then it executes a few random actions. What is recorded as intended is
-what it would have done there.
+The paper's data came from trained policies (Achievement Distillation), which are not available. A
+demonstrator draws an order of achievements for each episode and omits some of them, so that prompts differ;
+``envs.crafter.planning`` chooses its actions. It knows only what has been in view in this episode, as it
+was when last in view. Now and then it executes a few random actions; then the action that it would have
+taken is recorded as the intended one.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from envs.crafter.planning import (
 )
 from envs.crafter.searching import MOVES, contains
 
-NUM_RANDOM = Action.DO.value + 1  # random actions wait, move or act, and place and make nothing
+NUM_RANDOM = Action.DO.value + 1  # random actions wait, move or act, but never place or make
 
 
 class Memory(NamedTuple):
-    """What a demonstrator remembers within an episode."""
+    """The memory of a demonstrator within an episode."""
 
     blocks: UInt32[Array, "17 2 64"]
     """The board of each kind of block, as it was when last in view."""
@@ -45,13 +45,13 @@ class Memory(NamedTuple):
     noise: Float[Array, ""]
     """Probability that a run of random actions starts at a step."""
     left: Int[Array, ""]
-    """Random actions that are left of a run."""
+    """Number of random actions left in the current run."""
     intended: Int[Array, ""]
-    """The latest action, had it not been replaced by a random one."""
+    """The latest action before it may have been replaced by a random one."""
 
 
 def planner(habits: Habits) -> Agent:
-    """The demonstrator with these habits. It never quits."""
+    """The demonstrator with given habits. It never quits."""
 
     def begin(
         key: PRNGKeyArray, task: CrafterTask, state: CrafterState, timestep: TimeStep
@@ -71,7 +71,7 @@ def planner(habits: Habits) -> Agent:
     def proceed(
         key: PRNGKeyArray, memory: Memory, state: CrafterState, timestep: TimeStep
     ) -> tuple[Array, Array, Memory]:
-        del timestep  # the scene below is its observation, as boards
+        del timestep  # it observes the scene below instead, as boards
         key_act, key_noise = jax.random.split(key)
         blocks = look(memory.blocks, state.world)
         scene = scene_of(blocks, state.world)
@@ -86,7 +86,7 @@ def planner(habits: Habits) -> Agent:
 def disturbed(
     key: PRNGKeyArray, scene: Scene, memory: Memory, habits: Habits
 ) -> tuple[Int[Array, ""], Memory]:
-    """The action to execute: the intended one, or a random one during a run of those."""
+    """The action to execute: the intended one, or a random one during a run of random actions."""
     key_start, key_length, key_action = jax.random.split(key, 3)
     starts = jax.random.uniform(key_start) < memory.noise
     length = jax.random.randint(key_length, (), 1, habits.longest_run + 1)
@@ -106,21 +106,23 @@ def _deadly(scene: Scene, action: Int[Array, ""]) -> Bool[Array, ""]:
 
 HABITS = {
     "expert": Habits(),
-    # Does almost all that it can, and takes what comes: the highest returns, and the least varied prompts.
+    # Does almost everything it can, as opportunities arise: the highest returns, and the least varied
+    # prompts.
     "eager": Habits(drop=0.15, opportunism=1.0),
-    # Keeps to its order: what a demonstration does depends most on what its prompt says.
+    # Keeps to its order, so that demonstrations depend most on their prompts.
     "strict": Habits(shuffle=3.0, opportunism=0.3),
     "mapped": Habits(whole_map=1.0),
 }
-# Whether it knows the map or has to explore it: so that a policy does either, as its prompt says.
+# Knows the map in half of the episodes and explores it in the others, so that a policy can do both,
+# depending on its prompt.
 GUIDE = {"guide": Habits(drop=0.3, opportunism=0.6, whole_map=0.5)}
 
 
 def habits_of(settings: Mapping[str, float]) -> Habits:
-    """Habits whose values all are numbers.
+    """Make habits from numbers.
 
     Raises:
-      ValueError: for a number that is out of range, or is not whole where it counts something.
+      ValueError: if a number is out of range, or is not an integer for a count.
     """
     types = {habit.name: type(habit.default) for habit in fields(Habits)}
     for name, value in settings.items():
@@ -130,7 +132,7 @@ def habits_of(settings: Mapping[str, float]) -> Habits:
 
 
 def crafter_demonstrators(env: Crafter) -> dict[str, Demonstrator]:
-    """Demonstrators by name: the one of the released policy first."""
+    """The demonstrators by name; that of the released policy comes first."""
 
     def any_task(key: PRNGKeyArray, index: Int[Array, ""]) -> CrafterTask:
         del index

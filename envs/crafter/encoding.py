@@ -1,9 +1,10 @@
-"""The encoder ``crafter-picture``: a linear layer on Crafter's picture that does not draw it.
+"""The encoder ``crafter-picture``: a linear layer on Crafter's picture, computed without drawing it.
 
-A picture is a tile for each cell and an icon for each item, all of which stand at fixed places. What a
-linear layer makes of it is the sum of what it makes of each tile at its place, and that is looked up. Night
-mixes the tiles of day and night by the light, and sleep makes them gray, both of which are linear in the
-tiles. Only Crafter's rounding to bytes by night and asleep is left out, less than one and a half of 255.
+A picture consists of a tile for each cell and an icon for each item, all at fixed places. The output of a
+linear layer is therefore a sum over tiles at their places, whose terms are looked up in tables. Night mixes
+the tiles of day and night according to the light, and sleep makes them gray, both of which are linear in
+the tiles. Only Crafter's rounding to bytes at night and asleep is omitted, an error of less than one and a
+half of 255 levels.
 """
 
 from __future__ import annotations
@@ -40,24 +41,24 @@ from envs.crafter.view import (
     ROWS,
 )
 
-LEVELS = 255.0  # brightness is between 0 and 1
-MIDDLE = NUM_CELLS // 2  # where the agent stands
-TILE = UNIT * UNIT * 3  # numbers of a tile
+LEVELS = 255.0  # bytes are divided by this, so that brightness is between 0 and 1
+MIDDLE = NUM_CELLS // 2  # index of the cell on which the agent stands
+TILE = UNIT * UNIT * 3  # number of components of a tile
 
 
 class Shown(NamedTuple):
-    """Which tiles each of some observations shows at some cells, and in which light."""
+    """The tiles that observations show at some cells, and in which light."""
 
     row: Int[Array, "*batch cells"]
-    """The numbers of the tiles."""
+    """The index of the tile at each cell."""
     light: Float[Array, "*batch 1"]
-    """From 0 by night to 1 by day."""
+    """The light, from 0 at night to 1 by day."""
     asleep: Int[Array, "*batch"]
-    """1 if the agent sleeps, which makes tiles gray, else 0."""
+    """1 if the agent sleeps, which makes tiles gray, otherwise 0."""
 
 
 class Picture(nn.Module):
-    """A linear layer on the picture of 64 x 64 pixels of an observation of codes.
+    """A linear layer on the picture of 64 x 64 pixels, as a function of an observation of codes.
 
     Attributes:
       width: size of a token.
@@ -67,7 +68,8 @@ class Picture(nn.Module):
 
     @nn.compact
     def __call__(self, obs: Float[Array, "... 85"]) -> Float[Array, "..."]:
-        """Tokens ``[*batch, E]`` of observations; codes and counts are rounded into their range."""
+        """Tokens ``[*batch, E]`` of observations; codes and counts are rounded and clipped to their
+        range."""
         shape = (PIXELS, PIXELS, 3, self.width)
         init = nn.initializers.lecun_normal(in_axis=(0, 1, 2), out_axis=3)
         kernel = self.param("kernel", init, shape)
@@ -82,7 +84,7 @@ class Picture(nn.Module):
 
 
 def by_place(kernel: Float[Array, "64 64 3 E"]) -> Float[Array, "places TILE E"]:
-    """The weights of each cell of the view and of each item below it, row by row."""
+    """The weights for each cell of the view and each item below it, row by row."""
     width = kernel.shape[-1]
     used = kernel[: (ROWS + ITEM_ROWS) * UNIT, : COLUMNS * UNIT]
     apart = used.reshape(ROWS + ITEM_ROWS, UNIT, COLUMNS, UNIT, 3, width)
@@ -90,14 +92,14 @@ def by_place(kernel: Float[Array, "64 64 3 E"]) -> Float[Array, "places TILE E"]
 
 
 def gray_kernel(places: Float[Array, "places TILE E"]) -> Float[Array, "places TILE E"]:
-    """Weights that make of colors what ``places`` make of half their gray."""
+    """Weights whose output for colors is that of ``places`` for half of their gray."""
     pixels = places.reshape(len(places), -1, 3, places.shape[-1])
     share = jnp.asarray(GRAY / GRAY.sum(), jnp.float32)[:, None]
     return (0.5 * share * pixels.sum(axis=2, keepdims=True)).reshape(places.shape)
 
 
 def _sleep_offset(places: Float[Array, "places TILE E"]) -> Float[Array, "E"]:
-    """What the tint of sleep adds to a token."""
+    """The constant that the tint of sleep adds to a token."""
     pixels = places.reshape(-1, 3, places.shape[-1]).sum(axis=0)
     return jnp.asarray(0.5 * SLEEP / LEVELS, jnp.float32) @ pixels
 
@@ -107,10 +109,11 @@ def _with_cells(
     kernels: Float[Array, "2 63 TILE E"],
     obs: Float[Array, "*batch 85"],
 ) -> Float[Array, "*batch E"]:
-    """The token plus what the cells in view look like, with weights for being awake and asleep.
+    """The token plus the contributions of the cells in view, with weights for being awake and asleep.
 
-    On a CPU this goes cell by cell: what all cells look like at once would fill the memory. An accelerator
-    is slow at scattering the gradient over the tables and fast at products.
+    On a CPU these are added cell by cell, since those of all cells at once would fill the memory.
+    Accelerators are slow at scattering the gradient over the tables and fast at products, so they use a
+    product.
     """
     codes = jnp.clip(jnp.round(obs[..., :NUM_CELLS]), 0, NUM_CODES - 1).astype(jnp.int32)
     asleep = (obs[..., ASLEEP] > 0.5).astype(jnp.int32)
@@ -119,7 +122,7 @@ def _with_cells(
     facing = jnp.argmax(obs[..., NUM_CELLS + NUM_COUNTS :][..., :NUM_FACINGS], axis=-1)
     who = jnp.where(asleep > 0, NUM_FACINGS, facing)
     player = who * NUM_BLOCKS + codes[..., MIDDLE] % NUM_BLOCKS
-    # All tables outside of loops: they follow from the weights alone, and an episode makes them once.
+    # The tables depend only on the weights, so they are computed outside of loops, once per episode.
     of_cells = tables("day", kernels[:, others])
     of_player = tables("player", kernels[:, MIDDLE : MIDDLE + 1])
     add = _with_looked_up if jax.default_backend() == "cpu" else _with_multiplied
@@ -128,10 +131,10 @@ def _with_cells(
 
 
 def tables(kind: str, kernels: Float[Array, "2 cells TILE E"]) -> Float[Array, "cells 2 2 rows E"]:
-    """The products of the weights of some cells with every tile of a kind that they can show.
+    """The products of the weights of some cells with all tiles of a kind.
 
     Returns:
-      ``[cells, 2, 2, rows, E]``: awake or asleep, by day or by night.
+      ``[cells, 2, 2, rows, E]``: for each cell, awake or asleep, by day or at night, and each tile.
     """
     shown = np.stack([getattr(tiles(UNIT), kind), getattr(night_tiles(UNIT), kind)]) / LEVELS
     flat = jnp.asarray(shown.reshape(2, -1, TILE), jnp.float32)
@@ -141,7 +144,7 @@ def tables(kind: str, kernels: Float[Array, "2 cells TILE E"]) -> Float[Array, "
 def _with_looked_up(
     token: Float[Array, "*batch E"], tables: Float[Array, "cells 2 2 rows E"], shown: Shown
 ) -> Float[Array, "*batch E"]:
-    """The token plus the products of the tiles that are shown, mixed by the light, cell by cell."""
+    """The token plus the products for the tiles that are shown, mixed by the light, cell by cell."""
 
     def add(token: Array, cell: tuple[Array, Array]) -> tuple[Array, None]:
         table, row = cell
@@ -154,7 +157,7 @@ def _with_looked_up(
 def _with_multiplied(
     token: Float[Array, "*batch E"], tables: Float[Array, "cells 2 2 rows E"], shown: Shown
 ) -> Float[Array, "*batch E"]:
-    """The same as one product with one-hots, whose gradient is a product, too."""
+    """``_with_looked_up`` computed as one product with one-hots, whose gradient is a product, too."""
     hot = jax.nn.one_hot(shown.row, tables.shape[-2], dtype=tables.dtype)
     by_light = jnp.einsum("...cr,cslre->...sle", hot, tables)
     lights = jnp.concatenate([shown.light, 1 - shown.light], axis=-1)
@@ -167,7 +170,7 @@ def _with_items(
     places: Float[Array, "places TILE E"],
     obs: Float[Array, "*batch 85"],
 ) -> Float[Array, "*batch E"]:
-    """The token plus the icons of the items, which neither night nor sleep changes."""
+    """The token plus the contributions of the items' icons, which do not depend on night or sleep."""
     shown = tiles(UNIT).items.reshape(NUM_COUNTS, -1, TILE) / LEVELS
     counts = jnp.round(obs[..., NUM_CELLS : NUM_CELLS + NUM_COUNTS]).astype(jnp.int32)
     for place, name in enumerate(ITEMS):

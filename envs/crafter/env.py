@@ -1,17 +1,17 @@
 """Crafter: 22 achievements in a world that is generated from a seed (Hafner, 2022).
 
-Paper, appendix C.5, with Craftax-Classic in place of the Python program (``rules.py``). A task is the seed
-of a world; what mobs do is a matter of chance in each episode. An achievement is worth 1 when it is
-unlocked for the first time, and every point of health that is won or lost is worth 0.1. A goal is one
+Source: paper, appendix C.5, with Craftax-Classic in place of the Python program (``rules.py``). A task is
+the seed of a world; the mobs behave randomly in each episode. The reward is 1 when an achievement is
+unlocked for the first time, and plus or minus 0.1 for every point of health gained or lost. A goal is one
 achievement; the task goal is all of them.
 
-The observation is the codes of all that Crafter draws (``view.py``). The picture that Crafter draws of them
-(``tiles.py``) follows from them, so that a policy which sees the picture is one whose encoder makes it of
-the codes (``encoding.py``); with ``pixels`` the picture itself is the observation.
+The observation consists of the codes of everything that Crafter draws (``view.py``). Crafter's picture
+(``tiles.py``) is a function of these codes. A policy that sees the picture is therefore one whose encoder
+computes it from the codes (``encoding.py``); with ``pixels`` the picture itself is the observation.
 
-With places, a goal also says where its achievement was unlocked, and the agent knows where it is itself,
-both relative to the start. The map of a task stays the same in all its episodes, so a prompt of such goals
-says where things are. This is no part of the paper.
+With places, a goal also includes where its achievement was unlocked, and the agent observes its own
+position, both relative to the start. The map of a task is the same in all of its episodes, so a prompt of
+such goals tells where things are. This is not part of the paper.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ from envs.errors import UsageError
 
 HEALTH_REWARD = 0.1
 PLACE_UNIT = 8.0  # cells
-NUM_PLACE = 3  # numbers of a goal's place: whether it is known, rows and columns from the start
+NUM_PLACE = 3  # components of a goal's place: whether it is known, rows and columns from the start
 
 
 class CrafterTask(NamedTuple):
-    """A task: the world that the installed craftax generates from ``seed``, a whole number below 2**32."""
+    """A task: the world that the installed craftax generates from ``seed``, an integer below 2**32."""
 
     seed: UInt32[Array, "*batch"]
 
@@ -56,14 +56,14 @@ class CrafterState(NamedTuple):
     """An episode in progress."""
 
     world: EnvState
-    """Craftax-Classic's state: map ``[64, 64]``, mobs, inventory, achievements ``[22]``, needs."""
+    """The state of Craftax-Classic: map ``[64, 64]``, mobs, inventory, achievements ``[22]``, needs."""
     key: PRNGKeyArray
-    """Of the chance in the steps to come."""
+    """Random key of the following steps."""
     steps: Int[Array, ""]
     health: Int[Array, ""]
-    """After the agent's own last move, before the mobs made theirs."""
+    """The agent's health after its own last move, before the mobs moved."""
     unlocked: Bool[Array, "22"]
-    """What the last step unlocked; at most one achievement."""
+    """Which achievement, if any, the last step unlocked; at most one."""
 
 
 @dataclass(frozen=True)
@@ -71,13 +71,13 @@ class Crafter(Environment):
     """The world of Crafter.
 
     Attributes:
-      name: what it is called.
+      name: its name in messages and file names.
       horizon: number of steps of an episode.
       pixels: whether an observation is the picture, ``[64, 64, 3]`` bytes, instead of its codes, ``[85]``.
-      places: whether goals have places. A goal is then an achievement, whether its place is known (1) or
-        not (0), and the rows and columns from the start to where the agent stands when it is unlocked, in
-        units of 8 cells; an observation ends with the rows and columns from the start to the agent,
-        likewise.
+      places: whether goals have places. A goal then consists of an achievement, of whether its place is
+        known (1) or not (0), and of the rows and columns from the start to the agent's position when it was
+        unlocked, in units of 8 cells. An observation ends with the rows and columns from the start to the
+        agent, in the same units.
     """
 
     name: str
@@ -100,10 +100,10 @@ class Crafter(Environment):
             goal_dim=NUM_ACHIEVEMENTS + NUM_PLACE * self.places,
             actions=Discrete(NUM_ACTIONS),
             horizon=self.horizon,
-            # Nothing is unlocked and all health is lost; or everything is, and none is lost.
+            # Nothing is unlocked and all health is lost; or everything is unlocked and no health is lost.
             return_range=(-HEALTH_REWARD * MAX_COUNT, float(NUM_ACHIEVEMENTS)),
             deterministic=False,
-            # Every achievement is rewarded in any order, which says nothing about the order.
+            # Achievements are rewarded in any order, so rewards tell nothing about an order.
             reward_confirms_goals=False,
             layout=None if self.pixels else LAYOUT,
         )
@@ -117,18 +117,18 @@ class Crafter(Environment):
         return CrafterTask(seed=jax.random.bits(key, (), jnp.uint32))
 
     def sample_goal(self, key: PRNGKeyArray) -> Float[Array, "G"]:
-        """An achievement, in no known place."""
+        """A random achievement without a known place."""
         goal = jax.random.randint(key, (), 0, NUM_ACHIEVEMENTS)
         return self._without_place(jax.nn.one_hot(goal, NUM_ACHIEVEMENTS))
 
     @property
     def goal_set(self) -> np.ndarray:
-        """The achievements, in no known place."""
+        """One goal for each achievement, without a known place."""
         places = NUM_PLACE * self.places
         return np.pad(np.eye(NUM_ACHIEVEMENTS, dtype=np.float32), ((0, 0), (0, places)))
 
     def expert_goal(self, state: CrafterState, num_steps: int) -> Float[Array, "G"]:
-        """What usually comes first of the achievements that are not unlocked yet, in no known place."""
+        """The locked achievement that usually comes first, without a known place."""
         del num_steps
         place = jnp.asarray([TIERS[achievement] for achievement in Achievement])
         first = jnp.argmin(jnp.where(state.world.achievements, jnp.inf, place))
@@ -156,7 +156,7 @@ class Crafter(Environment):
             )
 
     def reset(self, key: PRNGKeyArray, task: CrafterTask) -> tuple[CrafterState, TimeStep]:
-        """The start in the world of the task, without anything and in full health."""
+        """Begin in the world of the task, with an empty inventory and full health."""
         world = new_world(task.seed.astype(jnp.uint32))
         state = CrafterState(
             world=world,

@@ -1,7 +1,7 @@
-"""The package behind Crafter: found and new enough, or a clear error. Nothing here imports jax.
+"""A check that the package behind Crafter is installed and new enough. Nothing here imports jax.
 
-Craftax holds the rules and the textures. Its own renderer keeps a cache of textures in the folder that it
-is installed in; that renderer is not used here, so nothing is ever written there.
+Craftax provides the rules and the textures. Its own renderer writes a cache of textures to the folder in
+which it is installed; that renderer is not used here, so nothing is ever written there.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ TEXTURES = Path("craftax_classic/assets")
 
 @cache
 def check_extra() -> None:
-    """Raise ``MissingExtraError`` unless Craftax can be loaded; imports nothing of it."""
+    """Raise ``MissingExtraError`` unless Craftax can be loaded, without importing it."""
     oldest = ".".join(map(str, OLDEST))
     try:
         found = version("craftax")
@@ -35,10 +35,10 @@ def check_extra() -> None:
 
 
 def texture_folder() -> Path:
-    """Where the installed Craftax keeps the textures of Crafter, as PNG files of 16 x 16 pixels.
+    """The folder of Crafter's textures in the installed Craftax, PNG files of 16 x 16 pixels.
 
     Raises:
-      MissingExtraError: if they are not there.
+      MissingExtraError: if the textures are missing.
     """
     spec = importlib.util.find_spec("craftax")
     for folder in (spec.submodule_search_locations or ()) if spec else ():

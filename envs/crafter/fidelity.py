@@ -1,8 +1,8 @@
-"""How close to Crafter and how fast this world is: ``python -m envs.crafter.fidelity``.
+"""Compares this world with Crafter, and measures its speed: ``python -m envs.crafter.fidelity``.
 
-It needs the Python package ``crafter``. Printed are what the maps consist of, how many mobs an agent sees
-that wanders about and cannot die, and the steps of a random agent in a CPU-second. That the rules agree is
-the subject of ``tests/test_crafter_official.py``.
+This needs the Python package ``crafter``. It prints the composition of maps, the number of mobs that a
+randomly walking immortal agent sees, and the steps per CPU-second of a random agent. That the rules agree
+is tested by ``tests/test_crafter_official.py``.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from envs.errors import UsageError
 BLOCKS_TOLD = ("grass", "water", "stone", "path", "sand", "tree", "coal", "iron", "diamond", "lava")
 MOBS_TOLD = ("zombies", "cows")
 MOVES = range(1, 5)  # left, right, up, down: the same numbers in both programs
-FIRST, DARKEST = slice(0, 100), slice(185, 235)  # steps; the light is least at step 210
+FIRST, DARKEST = slice(0, 100), slice(185, 235)  # ranges of steps; the light is lowest at step 210
 
 
 @dataclass(frozen=True)
@@ -37,17 +37,17 @@ class FidelityConfig:
     """Settings of this command."""
 
     worlds: int = 100
-    """Maps whose blocks are counted."""
+    """Number of maps whose blocks are counted."""
     walks: int = 32
-    """Walks of an agent that cannot die."""
+    """Number of walks of an immortal agent."""
     steps: int = 240
-    """Steps of each of them."""
+    """Number of steps of each walk."""
     lanes: int = 64
-    """Episodes of a random agent, side by side, whose speed is measured."""
+    """Number of simultaneous episodes of a random agent whose speed is measured."""
 
 
 def official() -> Any:
-    """The Python package.
+    """Import the Python package ``crafter``.
 
     Raises:
       UsageError: if it is missing.
@@ -60,7 +60,7 @@ def official() -> Any:
 
 
 def shares_here(num_worlds: int) -> dict[str, float]:
-    """Share of each kind of block in the maps of this world."""
+    """The fraction of each kind of block in the maps of this world."""
     seeds = jnp.arange(num_worlds, dtype=jnp.uint32)
     maps = np.asarray(jax.lax.map(jax.jit(lambda seed: new_world(seed).map), seeds))
     counts = np.bincount(maps.ravel(), minlength=len(BLOCKS)) / maps.size
@@ -69,7 +69,7 @@ def shares_here(num_worlds: int) -> dict[str, float]:
 
 
 def shares_in_crafter(num_worlds: int) -> dict[str, float]:
-    """The same in the maps of the package."""
+    """The fraction of each kind of block in the maps of the package."""
     found: Counter[str] = Counter()
     for seed in range(num_worlds):
         env = official().Env(seed=seed)
@@ -82,7 +82,7 @@ def shares_in_crafter(num_worlds: int) -> dict[str, float]:
 
 
 def seen_here(num_walks: int, num_steps: int) -> Float[np.ndarray, "T mobs"]:
-    """Zombies and cows in view of an agent that cannot die, mean over walks, after each step."""
+    """The number of zombies and cows in view of an immortal agent after each step, averaged over walks."""
     env = Crafter(name="crafter-symbolic", horizon=num_steps + 1)
 
     def walk(key: PRNGKeyArray, seed: Array) -> Array:
@@ -107,7 +107,7 @@ def seen_here(num_walks: int, num_steps: int) -> Float[np.ndarray, "T mobs"]:
 
 
 def seen_in_crafter(num_walks: int, num_steps: int) -> Float[np.ndarray, "T mobs"]:
-    """The same in the package."""
+    """The same numbers as ``seen_here``, in the package."""
     objects = official().objects
     found = np.zeros((num_walks, num_steps, len(MOBS_TOLD)))
     for seed in range(num_walks):
@@ -131,7 +131,7 @@ def in_view(place: Int[np.ndarray, "2"], agent: Int[np.ndarray, "2"]) -> bool:
 
 
 def random_agent() -> Agent:
-    """Takes any action."""
+    """The agent that takes uniformly random actions."""
 
     def proceed(key: PRNGKeyArray, memory: Any, state: Any, timestep: Any) -> tuple:
         return jax.random.randint(key, (), 0, NUM_ACTIONS), jnp.zeros((), bool), memory
@@ -140,7 +140,7 @@ def random_agent() -> Agent:
 
 
 def rate(pixels: bool, num_lanes: int) -> float:
-    """Steps of a random agent in a CPU-second, without compilation."""
+    """Steps per CPU-second of a random agent, without compilation."""
     env = Crafter(name="crafter", horizon=500, pixels=pixels)
     run = jax.jit(
         jax.vmap(lambda key, task: length_of(run_episode(key, env, random_agent(), task)))
@@ -154,14 +154,14 @@ def rate(pixels: bool, num_lanes: int) -> float:
 
 
 def length_of(episode: Any) -> Int[Array, ""]:
-    """Its number of steps, which follows from all that it records."""
+    """The number of steps of an episode, computed such that it depends on everything that was recorded."""
     record = episode.trajectory
-    # A sum of the observations, so that none of them is left out of the program.
+    # It includes a sum of the observations, so that the compiler does not eliminate them.
     return record.length + (jnp.sum(record.obs.astype(jnp.float32)) < -1.0)
 
 
 def report(config: FidelityConfig) -> Iterator[str]:
-    """Lines of Markdown: what is compared, in Crafter and here."""
+    """The comparison of Crafter and this world, as lines of Markdown."""
     yield "| | Crafter | here |\n| --- | --- | --- |"
     shares = shares_in_crafter(config.worlds), shares_here(config.worlds)
     for name in BLOCKS_TOLD:

@@ -1,4 +1,4 @@
-"""What Crafter brings to HTML pages: maps, and where an agent was on them. Its mobs are not in the page."""
+"""Crafter's part of HTML pages: maps, and the agent's path on them, without mobs."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from envs.page import Page
 
 
 def crafter_page(env: Crafter) -> Page:
-    """Maps with the ways of agents and what they unlocked."""
-    del env  # all kinds of it look the same
+    """Maps with the paths of agents and their achievements."""
+    del env  # all variants of Crafter have the same page
     names = [name_of(goal) for goal in range(NUM_ACHIEVEMENTS)]
     return Page(
         script=Path(__file__).with_name("page.js"),
@@ -51,6 +51,6 @@ def map_of(task: CrafterTask) -> list[str]:
 
 
 def track(state: CrafterState) -> Int[Array, "3"]:
-    """The row and column of the agent, and the number of the achievement that was just unlocked plus 1."""
+    """The agent's row and column, and 1 plus the index of the achievement just unlocked (0 for none)."""
     unlocked = jnp.where(jnp.any(state.unlocked), 1 + jnp.argmax(state.unlocked), 0)
     return jnp.append(state.world.player_position, unlocked)

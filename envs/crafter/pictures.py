@@ -1,7 +1,7 @@
-"""Pictures of Crafter: the map with the agent's way, the achievements over time, and what the agent sees.
+"""Pictures of Crafter: the map with the agent's path, the achievements over time, and the agent's view.
 
-An episode keeps what the agent saw and not where it was. Its way follows from what it saw and did, since
-all that can stop a move is in view.
+An episode records what the agent saw, but not where it was. Its path is reconstructed from its observations
+and actions, since everything that can block a move is in view.
 """
 
 from __future__ import annotations
@@ -36,19 +36,20 @@ from envs.drawing.palette import BLUE, GREEN, INK, ORANGE, PALE_INK, PAPER, PURP
 from envs.drawing.pictures import Pictures, Shown, observations
 from envs.drawing.video import Film, write_films
 
-UNIT = 16  # pixels of a cell of a map: Crafter's textures as they are
-VIDEO_UNIT = 24  # of a cell of a video
+UNIT = 16  # pixels of a cell of a map, the size of Crafter's textures
+VIDEO_UNIT = 24  # pixels of a cell of a video
 TIME_COLORS = LinearSegmentedColormap.from_list("time", ["#FFFFFF", ORANGE])
 COLORS = {"collect": GREEN, "place": BLUE, "make": ORANGE}  # of achievements, by their first word
 MARK = 1.5  # size of a mark on a map of 30 x 30 cells, in cells
 WALKABLE = ("grass", "sand", "path", "lava")
-MARGIN = 5  # cells around the way that a map shows at least
-BAR = 0.5  # height of the bar of achievements, as a share of the map's
-MOVES = ((0, 0), (0, -1), (0, 1), (-1, 0), (1, 0))  # of the first five actions
+MARGIN = 5  # smallest margin around the path on a map, in cells
+BAR = 0.5  # height of the bar of achievements, as a fraction of the map's
+MOVES = ((0, 0), (0, -1), (0, 1), (-1, 0), (1, 0))  # moves of the first five actions
 
 
 def crafter_pictures(env: Crafter) -> Pictures:
-    """What is drawn of Crafter. Where observations are pictures already, they make a video."""
+    """The pictures of Crafter. If observations are pictures already, its only picture is a video of
+    them."""
     if env.pixels:
         return Pictures(frame=np.asarray)
     return Pictures(episodes=draw_episodes, video=write_video, panel=(3.1, 5.2))
@@ -57,7 +58,7 @@ def crafter_pictures(env: Crafter) -> Pictures:
 def draw_episodes(
     axes: Sequence[Axes], tasks: Sequence[CrafterTask], shown: Sequence[Shown]
 ) -> None:
-    """The map of each world with the agent's way and its achievements, over the bar of achievements."""
+    """The map of each world with the agent's path and achievements, above the bar of achievements."""
     for ax, task, each in zip(axes, tasks, shown, strict=True):
         way, unlocked = way_of(each.episode), unlocks_of(each.episode)
         draw_map(ax, task, way, unlocked)
@@ -65,9 +66,9 @@ def draw_episodes(
 
 
 def way_of(episode: Episode) -> Int[np.ndarray, "P 2"]:
-    """Where the agent was at the start and after each step, as (row, column).
+    """The agent's position at the start and after each step, as (row, column).
 
-    The agent moves if the cell before it is free and it is awake, both of which it sees.
+    The agent moves if it is awake and the cell in front of it is free, both of which it observes.
     """
     seen = observations(episode)
     actions = np.asarray(episode.trajectory.actions)[: len(seen) - 1]
@@ -86,7 +87,7 @@ def way_of(episode: Episode) -> Int[np.ndarray, "P 2"]:
 
 
 def unlocks_of(episode: Episode) -> list[tuple[int, int]]:
-    """The achievements of one episode in their order, each with the number of steps it took."""
+    """The achievements of one episode in order, each with the step after which it was unlocked."""
     goals = np.asarray(episode.trajectory.achieved_goals)[: int(episode.trajectory.length)]
     goals = goals[:, :NUM_ACHIEVEMENTS]
     return [(int(goal), int(step) + 1) for step, goal in zip(*np.nonzero(goals > 0.5), strict=True)]
@@ -95,17 +96,17 @@ def unlocks_of(episode: Episode) -> list[tuple[int, int]]:
 def draw_map(
     ax: Axes, task: CrafterTask, way: Int[np.ndarray, "P 2"], unlocked: Sequence[tuple[int, int]]
 ) -> None:
-    """The part of the world around the agent's way, as it was at the start, from light to dark in time.
+    """Draw the part of the initial world around the agent's path, and the path from light to dark.
 
     Args:
-      ax: where to draw; its ticks and frame are removed.
+      ax: the axes to draw on; their ticks and frame are removed.
       task: the world.
-      way: where the agent was.
-      unlocked: pairs of an achievement and the step at which it was unlocked; numbered in their order.
+      way: the positions of the agent.
+      unlocked: pairs of an achievement and the step at which it was unlocked, which are numbered in order.
     """
     low = np.maximum(way.min(axis=0) - MARGIN, 0)
     high = np.minimum(way.max(axis=0) + MARGIN + 1, SIDE)
-    # A square piece, so that all maps of a figure are of one size.
+    # A square part, so that all maps of a figure have the same size.
     side = int(min(max(*(high - low)), SIDE))
     low = np.clip((low + high - side) // 2, 0, SIDE - side)
     top, left = low
@@ -141,11 +142,11 @@ def draw_map(
 
 
 def draw_bar(ax: Axes, unlocked: Sequence[tuple[int, int]], length: int) -> None:
-    """When each achievement was unlocked: one line for each, in the order of the map's numbers."""
+    """Draw when each achievement was unlocked, in one line for each, numbered as on the map."""
     for number, (goal, step) in enumerate(unlocked, start=1):
         color, late = color_of(goal), step > length / 2
         ax.barh(number, length - step, left=step, height=0.9, color=color)
-        # A label stands in its line, or before it where that is short.
+        # A label is within its line, or to the left of it if the line is short.
         label = ax.text(step, number, f" {number} {name_of(goal)} ", fontsize=5.5)
         label.set(ha="right" if late else "left", va="center_baseline")
         label.set_color(INK if late else ink_on(color))
@@ -159,17 +160,17 @@ def draw_bar(ax: Axes, unlocked: Sequence[tuple[int, int]], length: int) -> None
 
 
 def name_of(goal: int) -> str:
-    """An achievement in words."""
+    """The name of an achievement as text."""
     return ACHIEVEMENTS[goal].replace("_", " ")
 
 
 def color_of(goal: int) -> str:
-    """The color of what an achievement is about: collecting, placing, making, and the rest."""
+    """The color of an achievement's kind: collecting, placing, making, or other."""
     return COLORS.get(ACHIEVEMENTS[goal].split("_")[0], PURPLE)
 
 
 def map_picture(task: CrafterTask) -> UInt8[np.ndarray, "height width 3"]:
-    """The whole world of a task as it is at the start, 16 pixels a cell."""
+    """A picture of the whole initial world of a task, with 16 pixels per cell."""
     blocks = np.asarray(blocks_of(jnp.asarray(task.seed, jnp.uint32)))
     cells = tiles(UNIT).day[blocks]
     return cells.swapaxes(1, 2).reshape(SIDE * UNIT, SIDE * UNIT, 3)
@@ -177,12 +178,13 @@ def map_picture(task: CrafterTask) -> UInt8[np.ndarray, "height width 3"]:
 
 @jax.jit
 def blocks_of(seed: UInt32[Array, ""]) -> Int[Array, "64 64"]:
-    """The blocks of the world of a seed at its start."""
+    """The initial blocks of the world of a seed."""
     return new_world(seed).map
 
 
 def write_video(path: Path, task: CrafterTask, shown: Sequence[Shown]) -> None:
-    """What the agent sees in episodes on one task, side by side, and what it has unlocked so far."""
+    """Write a video of the agent's view in episodes on one task, side by side, with its achievements so
+    far."""
     films = [_film(each) for each in shown]
     write_films(path, films, f"Crafter, the world of seed {int(task.seed)}")
 

@@ -1,11 +1,11 @@
-"""What to do next in Crafter: from what is known to an errand, and from an errand to an action.
+"""The demonstrator's decisions in Crafter: from its knowledge to an errand, and from that to an action.
 
-For each achievement the recipes say what has to be done next for it, an ``Errand``: go to some kind of
-place and act there. Whose errand is run is decided anew at every step: first a zombie at hand is fought,
-then a shelter is dug at night, then tiredness, thirst and hunger are seen to. Otherwise it is the turn of
-the achievement that is first in the order of the episode, in which what is in view comes earlier.
-The way is the cheapest one over what is known. The unknown counts as a place that is far away, so that one
-search decides between going to what is known and exploring.
+For each achievement the recipes determine the next errand (``Errand``): go to some kind of place and act
+there. Which errand to run is decided anew at every step. A zombie nearby is fought first, then a shelter is
+dug at night, then come tiredness, thirst and hunger. Otherwise it is the turn of the first achievement in
+the order of the episode, in which achievements whose places are in view come earlier. The agent takes the
+cheapest path through known cells. Unknown cells count as a place that is far away, so that one search
+decides between known places and exploration.
 """
 
 from __future__ import annotations
@@ -43,20 +43,20 @@ from envs.crafter.searching import (
 from envs.crafter.view import COLUMNS, NUM_ACHIEVEMENTS, NUM_BLOCKS, ROWS
 
 HALF_VIEW = (ROWS // 2, COLUMNS // 2)  # rows and columns to either side of the agent
-TABLE_WOOD = 2  # as Craftax and Crafter 1.8.3 have it
+TABLE_WOOD = 2  # wood for a table, in Craftax and in Crafter 1.8.3
 WALKABLE = (BlockType.GRASS, BlockType.SAND, BlockType.PATH)
-FAR = 99  # steps to what is not in view
-NEVER = 1000.0  # place in the order of what cannot be done now
+FAR = 99  # distance of mobs that are not in view
+NEVER = 1000.0  # place in the order of an achievement that is impossible at present
 
-# The place of an errand is a number. The first 17 are kinds of blocks, by their codes, and the next three
-# kinds of mobs: the agent walks beside one and faces it. Then come cells that it walks onto.
+# The place of an errand is a number. The first 17 are kinds of blocks, by code, and the next three are
+# kinds of mobs: the agent walks next to one of them and faces it. The others are cells that it walks onto.
 COW, ZOMBIE, SKELETON = range(NUM_BLOCKS, NUM_BLOCKS + 3)
 AT_TABLE, AT_WORKSHOP, DEN = range(NUM_BLOCKS + 3, NUM_BLOCKS + 6)
-ANYWHERE = NUM_BLOCKS + 6  # to look for what is not known yet
-HERE = NUM_BLOCKS + 7  # to act at once
-FREE, SOIL = NUM_BLOCKS + 8, NUM_BLOCKS + 9  # to face a free cell, or grass, and place something
+ANYWHERE = NUM_BLOCKS + 6  # explore
+HERE = NUM_BLOCKS + 7  # act at once
+FREE, SOIL = NUM_BLOCKS + 8, NUM_BLOCKS + 9  # face a free cell, or grass, and place something
 
-# Where an achievement usually comes; the order of an episode is this and chance.
+# The usual place of each achievement in an order; the order of an episode adds noise to it.
 TIERS: Mapping[Achievement, float] = {
     Achievement.COLLECT_WOOD: 0.0,
     Achievement.COLLECT_SAPLING: 1.0,
@@ -87,26 +87,26 @@ RANGES = {
     "drop": (0, 0.5), "shuffle": (0, 100), "opportunism": (0, 1), "shelter": (0, 1), "dusk": (0, 1),
     "detour": (0, 80), "noise": (0, 0.5), "longest_run": (1, 100), "whole_map": (0, 1),
 }  # fmt: skip
-"""The least and the largest value of each habit."""
+"""The smallest and the largest value of each habit."""
 
 
 @dataclass(frozen=True)
 class Habits:
-    """How a demonstrator behaves.
+    """The behavior of a demonstrator.
 
     Attributes:
-      drop: share of the achievements that an episode does not strive for, on average over episodes, each of
-        which draws its own share between 0 and twice this number.
+      drop: fraction of the achievements that are omitted in an episode, on average. Each episode draws its
+        own fraction between 0 and twice this number.
       shuffle: standard deviation of an achievement's place in the order, in tiers.
-      opportunism: how much earlier than in its order an achievement comes when it can be had nearby; 0
-        keeps strictly to the order.
-      shelter: whether it digs in for the night.
-      dusk: light below which it does.
-      detour: steps by which something known may be farther away than the unknown.
-      noise: probability that a run of random actions starts at a step, on average over episodes, each of
-        which draws its own between 0 and twice this number.
-      longest_run: of random actions.
-      whole_map: share of the episodes in which it knows the map from the start.
+      opportunism: how strongly an achievement that is possible nearby is preferred to the order; 0 keeps
+        strictly to the order.
+      shelter: whether to dig a shelter for the night.
+      dusk: the light below which it does so.
+      detour: number of steps by which a known place may be farther away than unknown cells.
+      noise: probability that a run of random actions starts at a step, on average. Each episode draws its
+        own probability between 0 and twice this number.
+      longest_run: largest number of random actions in a run.
+      whole_map: fraction of the episodes in which it knows the map from the start.
     """
 
     drop: float = 0.45
@@ -127,10 +127,10 @@ class Habits:
 
 
 class Plan(NamedTuple):
-    """What an episode strives for."""
+    """The plan of an episode: which achievements to pursue, and in which order."""
 
     places: Float[Array, "22"]
-    """Of the achievements in the order; the least comes first."""
+    """The place of each achievement in the order; the smallest comes first."""
     wanted: Bool[Array, "22"]
 
 
@@ -143,13 +143,13 @@ class Sighting(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """What the demonstrator knows at one step."""
+    """The demonstrator's knowledge at one step."""
 
     blocks: UInt32[Array, "17 2 64"]
     """The board of each kind of block, as it was when last in view."""
     here: Cell
     facing: Int[Array, ""]
-    """Row of ``MOVES``."""
+    """Direction of the agent, a row of ``MOVES``."""
     bag: Inventory
     health: Int[Array, ""]
     food: Int[Array, ""]
@@ -159,13 +159,13 @@ class Scene(NamedTuple):
     light: Float[Array, ""]
     time: Int[Array, ""]
     done: Bool[Array, "22"]
-    """Achievements so far."""
+    """The achievements unlocked so far."""
     cows: Sighting
     zombies: Sighting
     skeletons: Sighting
 
     def of(self, *kinds: BlockType) -> Board:
-        """The known cells of these kinds."""
+        """The known cells with blocks of these kinds."""
         return union(*(self.blocks[kind.value] for kind in kinds))
 
     @property
@@ -190,11 +190,11 @@ def errand(place: int | BlockType, act: Action = Action.DO) -> Errand:
 
 
 def either(condition: Array, one: Errand, other: Errand) -> Errand:
-    """``one`` where the condition holds, ``other`` elsewhere."""
+    """``one`` if the condition holds, otherwise ``other``."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), one, other)
 
 
-# Seeing.
+# Observing.
 
 
 def unknown_map() -> UInt32[Array, "17 2 64"]:
@@ -208,7 +208,7 @@ def whole_map(world: EnvState) -> UInt32[Array, "17 2 64"]:
 
 
 def look(blocks: UInt32[Array, "17 2 64"], world: EnvState) -> UInt32[Array, "17 2 64"]:
-    """The boards of blocks after a look at what is in view."""
+    """Update the boards of known blocks with what is in view."""
     corner = world.player_position - jnp.array(HALF_VIEW)
     rows, columns = (corner[0] + jnp.arange(ROWS), corner[1] + jnp.arange(COLUMNS))
     view = world.map[jnp.clip(rows, 0, SIDE - 1)[:, None], jnp.clip(columns, 0, SIDE - 1)]
@@ -217,7 +217,8 @@ def look(blocks: UInt32[Array, "17 2 64"], world: EnvState) -> UInt32[Array, "17
 
 
 def scene_of(blocks: UInt32[Array, "17 2 64"], world: EnvState) -> Scene:
-    """What is known when ``blocks`` are: the rest is on the screen at this step."""
+    """The demonstrator's knowledge: the known ``blocks``, and everything that is on the screen at this
+    step."""
     here = world.player_position
 
     def sighting(mobs: Mobs) -> Sighting:
@@ -252,7 +253,7 @@ def scene_of(blocks: UInt32[Array, "17 2 64"], world: EnvState) -> Scene:
 
 
 def make_plan(key: PRNGKeyArray, habits: Habits) -> Plan:
-    """The order of an episode, and what is left out of it."""
+    """Draw the order of an episode and the achievements that it omits."""
     key_order, key_drop, key_share = jax.random.split(key, 3)
     tiers = jnp.array([TIERS[achievement] for achievement in Achievement])
     share = 2 * habits.drop * jax.random.uniform(key_share)
@@ -263,15 +264,15 @@ def make_plan(key: PRNGKeyArray, habits: Habits) -> Plan:
 
 
 class Surroundings(NamedTuple):
-    """What lies around, as far as several rules ask for it."""
+    """Facts about the agent's surroundings that several rules need."""
 
     table: Bool[Array, ""]
-    """Whether a table is at hand; tools are made there."""
+    """Whether a table is within reach, so that tools can be made."""
     furnace: Bool[Array, ""]
     table_near: Bool[Array, ""]
-    """Whether a table is so near that it is worth the way; otherwise a new one is."""
+    """Whether a table is near enough to walk to it; otherwise placing a new one is better."""
     workshop: Board
-    """Cells to stand on with a table and a furnace at hand."""
+    """The cells from which both a table and a furnace are within reach."""
     workshop_near: Bool[Array, ""]
 
 
@@ -289,7 +290,7 @@ def surroundings(scene: Scene) -> Surroundings:
 
 
 def plain_errands() -> dict[Achievement, Errand]:
-    """What can be done with nothing in the bag."""
+    """The errands that need nothing in the inventory."""
     return {
         Achievement.COLLECT_WOOD: errand(BlockType.TREE),
         Achievement.EAT_COW: errand(COW),
@@ -303,7 +304,7 @@ def plain_errands() -> dict[Achievement, Errand]:
 
 
 def errands_of(scene: Scene, nearby: Surroundings) -> Errand:
-    """What has to be done next for each achievement, ``[22]``, by the recipes."""
+    """The next errand for each achievement, ``[22]``, according to the recipes."""
     bag = scene.bag
     tree = errand(BlockType.TREE)
 
@@ -364,14 +365,14 @@ def errands_of(scene: Scene, nearby: Surroundings) -> Errand:
 
 
 def in_danger(scene: Scene) -> Bool[Array, ""]:
-    """Whether it would be unwise to fall asleep here."""
+    """Whether it would be dangerous to fall asleep here."""
     return (scene.zombies.distance < 7) | (scene.skeletons.distance < FAR)
 
 
 def advances(scene: Scene) -> Float[Array, "22"]:
-    """By how many tiers each achievement comes earlier than in its order, as things lie.
+    """The number of tiers by which each achievement currently comes earlier than in its order.
 
-    What depends on luck, such as meeting a cow, comes later while it is not in sight.
+    An achievement that depends on luck, such as meeting a cow, comes later while its object is not in view.
     """
     view = rectangle(scene.here, *HALF_VIEW)
 
@@ -396,10 +397,10 @@ def advances(scene: Scene) -> Float[Array, "22"]:
 
 
 def next_errand(scene: Scene, plan: Plan, nearby: Surroundings, habits: Habits) -> Errand:
-    """The errand of the achievement whose turn it is; to explore when nothing is left to be done."""
+    """The errand of the achievement whose turn it is, or exploration if nothing is left to do."""
     undone = plan.wanted & ~scene.done
     advance = advances(scene)
-    # What cannot be done at all is not a matter of taste.
+    # Impossible achievements stay impossible, whatever the habits are.
     advance = jnp.where(advance > -NEVER, habits.opportunism * advance, advance)
     turn = jnp.where(undone, plan.places - advance, NEVER)
     first = jnp.argmin(turn)
@@ -409,7 +410,8 @@ def next_errand(scene: Scene, plan: Plan, nearby: Surroundings, habits: Habits) 
 
 
 def stocked_up(scene: Scene, plan: Plan, chosen: Errand) -> Errand:
-    """More wood before leaving the trees, and more stone before leaving the rock, for what is to come."""
+    """Replace the errand by collecting more wood before leaving trees, or more stone before leaving
+    rock."""
     bag, missing = scene.bag, (plan.wanted & ~scene.done).astype(jnp.int32)
 
     def goes_to(*kinds: int) -> Array:
@@ -432,7 +434,7 @@ def stocked_up(scene: Scene, plan: Plan, chosen: Errand) -> Errand:
 
 
 def with_needs(scene: Scene, chosen: Errand) -> Errand:
-    """The errand, unless hunger, thirst or tiredness come first."""
+    """The errand, or a more urgent one because of hunger, thirst or tiredness."""
     knows_water = jnp.any(scene.of(BlockType.WATER))
     hungry = (scene.food <= 3) & (scene.cows.distance < FAR) | (scene.food <= 1)
     thirsty = (scene.drink <= 3) & knows_water | (scene.drink <= 1)
@@ -443,15 +445,15 @@ def with_needs(scene: Scene, chosen: Errand) -> Errand:
 
 
 class Shelter(NamedTuple):
-    """How the demonstrator could be safe for a night."""
+    """A way for the demonstrator to be safe for a night."""
 
     errand: Errand
-    """The next step towards sleeping behind closed walls."""
+    """The next errand towards sleeping behind closed walls."""
     possible: Bool[Array, ""]
     closed: Bool[Array, ""]
-    """Whether nothing can walk to where it is."""
+    """Whether nothing can walk to the agent's cell."""
     dens: Board
-    """Cells to dig to: rock with at most one open side."""
+    """The cells to dig to: rock with at most one open side."""
 
 
 def shelter(scene: Scene) -> Shelter:
@@ -462,7 +464,7 @@ def shelter(scene: Scene) -> Shelter:
     here = single(scene.here)
 
     def is_closed(open_: Board) -> Array:
-        """Whether the open cells that can be walked to from here are few."""
+        """Whether only few open cells can be reached from here."""
         room = here
         for _ in range(3):
             room = (spread(room) & open_) | here
@@ -472,7 +474,7 @@ def shelter(scene: Scene) -> Shelter:
         return is_closed(open_ & ~single(cell))
 
     moves = jnp.asarray(MOVES)
-    # One step back towards the entrance, to face the cell that a stone would have to fill.
+    # One step back towards the entrance, to face the cell in which a stone must be placed.
     back = beside(open_ & ~scene.mobs, scene.here) & jax.vmap(
         lambda move: closed_by(scene.here + 2 * move)
     )(moves)
@@ -498,14 +500,14 @@ def shelter(scene: Scene) -> Shelter:
 
 
 def wants_rest(scene: Scene, habits: Habits) -> Bool[Array, ""]:
-    """Whether it is time to dig in: at night, if nothing else is urgent."""
+    """Whether it is time to dig a shelter: at night, if nothing else is urgent."""
     night = (scene.light < habits.dusk) & (scene.time > 100) & (scene.energy < 8)
     urgent = (scene.drink <= 1) | (scene.food <= 1)
     return (night | (scene.energy <= 2)) & ~urgent
 
 
 def choose(scene: Scene, plan: Plan, habits: Habits) -> tuple[Errand, UInt32[Array, "P 2 64"]]:
-    """The errand of this step, and the boards of the kinds of places, in the order of their numbers."""
+    """The errand of this step, and the board of each kind of place, by number."""
     nearby = surroundings(scene)
     chosen = with_needs(scene, next_errand(scene, plan, nearby, habits))
     zombies = scene.zombies.distance
@@ -526,11 +528,11 @@ def choose(scene: Scene, plan: Plan, habits: Habits) -> tuple[Errand, UInt32[Arr
     return chosen, jnp.concatenate([kinds, jnp.stack(others)])
 
 
-# Running it.
+# Running the errand.
 
 
 def act(key: PRNGKeyArray, scene: Scene, plan: Plan, habits: Habits) -> Int[Array, ""]:
-    """The action that the demonstrator intends; asleep, none."""
+    """The action that the demonstrator intends; the no-op while it sleeps."""
     key_walk, key_place = jax.random.split(key)
     chosen, places = choose(scene, plan, habits)
     at_once = chosen.place == HERE
@@ -544,7 +546,7 @@ def act(key: PRNGKeyArray, scene: Scene, plan: Plan, habits: Habits) -> Int[Arra
 
 
 def terrain_of(scene: Scene) -> Terrain:
-    """What the demonstrator can walk over, dig through or bridge with what it has."""
+    """The terrain that the demonstrator can walk over, dig through or bridge with its inventory."""
     bag, mobs = scene.bag, scene.mobs
 
     def given(condition: Array, board: Board) -> Board:
@@ -565,14 +567,14 @@ def walk(
     needed: Bool[Array, ""],
     habits: Habits,
 ) -> Int[Array, ""]:
-    """One step towards a place: move, turn, or remove what is in the way; ``DO`` on arrival."""
+    """The action of one step towards a place: move, turn, or remove an obstacle; ``DO`` on arrival."""
     key_tie, key_lost = jax.random.split(key)
     targets = places[jnp.minimum(place, len(places) - 1)]
     terrain = terrain_of(scene)
     unknown = ~union(*scene.blocks)
     ahead = unknown & ahead_of(scene)
     detour = jnp.where(place == ANYWHERE, 0, habits.detour)
-    # What is ahead is explored first: no turning to and fro.
+    # Cells ahead are explored first, so that the agent does not turn back and forth.
     aims = Aims(
         boards=jnp.stack([targets, ahead, unknown]),
         costs=jnp.stack([jnp.zeros_like(detour), detour, detour + 5]),
@@ -595,15 +597,15 @@ def walk(
 
 
 def ahead_of(scene: Scene) -> Board:
-    """The square of 31 cells a side that lies in front."""
+    """The square with a side of 31 cells in front of the agent."""
     return rectangle(scene.here + 16 * jnp.asarray(MOVES)[scene.facing], 15, 15)
 
 
 def put(key: PRNGKeyArray, scene: Scene, chosen: Errand) -> Int[Array, ""]:
-    """Place something in front, or turn to where it can be placed.
+    """The action to place something in front, or to turn towards a cell where it can be placed.
 
-    To turn to a free cell is to step into it: best where it leads on to another free cell, and not away
-    from a table.
+    Turning towards a free cell means stepping into it, which is best if there is another free cell behind
+    it, and if it does not lead away from a table.
     """
     soil = scene.of(BlockType.GRASS)
     ground = jnp.where(chosen.place == SOIL, soil, scene.of(*WALKABLE)) & ~scene.mobs

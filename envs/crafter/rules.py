@@ -1,9 +1,9 @@
-"""The rules of Crafter 1.8.3, made of those of Craftax-Classic.
+"""The rules of Crafter 1.8.3, based on those of Craftax-Classic.
 
 Craftax-Classic (Matthews et al., 2024) re-implements Crafter (Hafner, 2022) in JAX and differs from it in
-several rules. Here its functions are called in Crafter's order, the agent before the mobs, and what goes in
-and comes out is changed where Crafter has another rule. The package itself is left as it is. What still
-differs is listed in ``docs/environments.md``.
+several rules. Here its functions are called in Crafter's order, the agent before the mobs, and their inputs
+and outputs are adjusted where Crafter has another rule. The package itself is not modified. The remaining
+differences are listed in ``docs/environments.md``.
 
 Positions are (row, column); north is row - 1. Crafter's x is the column, its y the row.
 """
@@ -21,11 +21,11 @@ from craftax.craftax_classic.world_gen import generate_world
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 
 SIDE = 64  # cells of the map, in rows and in columns
-AGING_DISTANCE = 18  # steps from the agent: a plant this far away or farther does not age
-RIPE_AGE = 301  # steps after which a plant is ripe
+AGING_DISTANCE = 18  # distance from the agent, in steps, from which on plants do not age
+RIPE_AGE = 301  # number of steps after which a plant is ripe
 FURNACE_STONES = 4
 
-CHUNK = 12  # cells of a side of the squares in which mobs are kept balanced
+CHUNK = 12  # side in cells of the squares in which the number of mobs is balanced
 
 _PARAMS = EnvParams()
 _STATIC = StaticEnvParams(map_size=(SIDE, SIDE), max_zombies=5, max_cows=3, max_skeletons=2)
@@ -34,23 +34,23 @@ _NEIGHBORS = jnp.array([[0, -1], [0, 1], [-1, 0], [1, 0]])
 
 
 def new_world(seed: UInt32[Array, ""]) -> EnvState:
-    """The world of a seed at its start; the agent stands at its center and faces south, as in Crafter."""
+    """Generate the world of a seed; the agent stands at its center and faces south, as in Crafter."""
     world = generate_world(jax.random.key(seed), _PARAMS, _STATIC)
     world = world.replace(player_direction=Action.DOWN.value, state_rng=None)
-    # Some leaves are Python numbers; arrays of one type can be carried through a loop.
+    # Some leaves are Python numbers; as arrays of fixed dtypes they can be carried through a loop.
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.asarray(leaf).dtype), world)
 
 
 def advance(
     key: PRNGKeyArray, world: EnvState, health: Int[Array, ""], action: Int[Array, ""]
 ) -> tuple[EnvState, Int[Array, ""]]:
-    """One step.
+    """Take one step.
 
     Args:
       key: random key, for saplings and mobs.
       world: the world.
-      health: the agent's health after its own last move, before the mobs made theirs.
-      action: one of Crafter's 17 actions, in its order.
+      health: the agent's health after its own last move, before the mobs moved.
+      action: one of Crafter's 17 actions, in Crafter's order.
 
     Returns:
       The world, and the agent's health after its own move.
@@ -64,7 +64,7 @@ def advance(
     world = _move(world, action)
     world = game_logic.update_player_intrinsics(world, action)
     world = game_logic.update_health(game_logic.cap_inventory(world))
-    # Whoever has been hurt since the last move wakes up.
+    # The agent wakes up if it was hurt since its last move.
     hurt = world.player_health < health
     world = world.replace(is_sleeping=world.is_sleeping & ~hurt)
     health = world.player_health
@@ -82,7 +82,8 @@ def advance(
 
 
 def _craft(world: EnvState, action: Int[Array, ""]) -> EnvState:
-    """Make a tool. Craftax takes a stone for those of iron, Crafter takes none: it is lent."""
+    """Make a tool. For iron tools Craftax takes a stone, but Crafter does not, so the stone is given
+    back."""
     stone = world.inventory.stone
     is_iron = jnp.any(action == _IRON_TOOLS)
     lent = world.replace(inventory=world.inventory.replace(stone=stone + is_iron))
@@ -92,11 +93,11 @@ def _craft(world: EnvState, action: Int[Array, ""]) -> EnvState:
 
 
 def _do(key: PRNGKeyArray, world: EnvState, action: Int[Array, ""]) -> EnvState:
-    """Act on what is in front of the agent.
+    """Act on the cell in front of the agent.
 
-    In Craftax a second sword of a kind hits harder, an eaten plant also stills the hunger that has not
-    shown yet, and a mob that has vanished is alive again as soon as the agent acts, since only its health
-    is looked at. Crafter has none of these rules.
+    Three rules of Craftax are not in Crafter, and are undone here: a second sword of a kind hits harder;
+    eating a plant also resets the hidden hunger counter; and a mob that has vanished is alive again as soon
+    as the agent acts, since only its health is tested.
     """
     bag = world.inventory
     one_each = bag.replace(
@@ -114,18 +115,19 @@ def _do(key: PRNGKeyArray, world: EnvState, action: Int[Array, ""]) -> EnvState:
             wood_sword=bag.wood_sword, stone_sword=bag.stone_sword, iron_sword=bag.iron_sword
         ),
         player_hunger=jnp.where(ate_plant, world.player_hunger, after.player_hunger),
-        zombies=_only(after.zombies, world.zombies.mask),
-        cows=_only(after.cows, world.cows.mask),
-        skeletons=_only(after.skeletons, world.skeletons.mask),
+        zombies=_restricted(after.zombies, world.zombies.mask),
+        cows=_restricted(after.cows, world.cows.mask),
+        skeletons=_restricted(after.skeletons, world.skeletons.mask),
     )
 
 
-def _only(mobs: Mobs, alive: Bool[Array, "M"]) -> Mobs:
+def _restricted(mobs: Mobs, alive: Bool[Array, "M"]) -> Mobs:
+    """The mobs without those that were not ``alive`` before."""
     return mobs.replace(mask=mobs.mask & alive)
 
 
 def _place(world: EnvState, action: Int[Array, ""]) -> EnvState:
-    """Place a block or a plant. A furnace takes four stones, and lava bears stones alone."""
+    """Place a block or a plant. A furnace takes four stones, and only stones can be placed on lava."""
     row, column = _in_front(world)
     on_lava = world.map[row, column] == BlockType.LAVA.value
     is_table, is_furnace = action == Action.PLACE_TABLE.value, action == Action.PLACE_FURNACE.value
@@ -138,38 +140,38 @@ def _place(world: EnvState, action: Int[Array, ""]) -> EnvState:
 
 
 def _move(world: EnvState, action: Int[Array, ""]) -> EnvState:
-    """Turn and move. In Craftax the edge of the map opens where there is lava at the opposite edge."""
+    """Turn and move. In Craftax the agent can leave the map where there is lava at the opposite edge."""
     world = game_logic.move_player(world, action)
     return world.replace(player_position=jnp.clip(world.player_position, 0, SIDE - 1))
 
 
 def _move_mobs(key: PRNGKeyArray, world: EnvState) -> EnvState:
-    """Move the mobs. Whoever they hurt wakes up with the next move, which is no achievement."""
+    """Move the mobs. An agent that they hurt wakes up with its next move, which is not an achievement."""
     after = game_logic.update_mobs(key, world, _PARAMS, _STATIC)
     return after.replace(is_sleeping=world.is_sleeping, achievements=world.achievements)
 
 
 class _Kept(NamedTuple):
-    """How many mobs of a kind Crafter keeps in a chunk, and how."""
+    """The parameters by which Crafter balances the number of mobs of a kind in a chunk."""
 
     material: int  # code of the block that they appear on
-    health: int  # of one that appears
-    least: Float[Array, ""]  # number of them, rounded down, below which another one may appear
-    most: Float[Array, ""]  # number of them, rounded down, above which one may vanish
-    room: int  # cells of the material without which none appears
-    appear: float  # probability of one more, each time that the chunk has its turn
-    vanish: float  # probability of one less, likewise
-    away: int  # least steps to the agent at which one appears
-    gone: int  # least steps to the agent at which one vanishes
+    health: int  # health of a new mob
+    least: Float[Array, ""]  # number of mobs, rounded down, below which another one may appear
+    most: Float[Array, ""]  # number of mobs, rounded down, above which one may vanish
+    room: int  # smallest number of cells of the material for one to appear
+    appear: float  # probability that one appears when it is the chunk's turn
+    vanish: float  # probability that one vanishes when it is the chunk's turn
+    away: int  # smallest distance to the agent, in steps, at which one appears
+    gone: int  # smallest distance to the agent, in steps, at which one vanishes
 
 
 def _balance(key: PRNGKeyArray, world: EnvState) -> EnvState:
-    """Let one mob of each kind appear or vanish in a chunk near the agent, at most.
+    """Let at most one mob of each kind appear or vanish in a chunk near the agent.
 
-    Crafter does so in every chunk of the map, in every tenth step. Here each of the nine chunks around the
-    agent has its turn with a probability of a tenth in each step. Crafter's worlds begin with cows and
-    skeletons everywhere, and hardly get more; here these appear as the agent comes near, with probability
-    0.3 instead of 0.01 and 0.1.
+    Crafter does so in every chunk of the map in every tenth step. Here each of the nine chunks around the
+    agent has its turn with a probability of one tenth in each step. In Crafter the initial world is full of
+    cows and skeletons, and few are added; here they appear when the agent comes near, with probability 0.3
+    instead of 0.01 and 0.1.
     """
     key_chunk, key_kinds = jax.random.split(key)
     turn = jax.random.randint(key_chunk, (), 0, 10)
@@ -201,7 +203,7 @@ def _balance_kind(
     chunk: Int[Array, "2"],
     its_turn: Bool[Array, ""],
 ) -> tuple[Mobs, Bool[Array, "64 64"]]:
-    """The mobs of a kind and the map of all mobs, after at most one appeared or vanished in a chunk."""
+    """Balance one kind of mobs in a chunk; returns these mobs and the map of all mobs."""
     rows, columns = (CHUNK * chunk[:, None] + jnp.arange(CHUNK))[..., None]
     rows, columns = jnp.broadcast_arrays(rows, columns.T)
     on_map = (rows >= 0) & (rows < SIDE) & (columns >= 0) & (columns < SIDE)
@@ -225,7 +227,7 @@ def _balance_kind(
 
     slot = jnp.where(appears, jnp.argmin(mobs.mask), jnp.where(vanishes, who, len(mobs.mask)))
     where = jnp.where(appears, place, mobs.position[who])
-    row = jnp.where(appears | vanishes, where[0], SIDE)  # what is off the map is not written
+    row = jnp.where(appears | vanishes, where[0], SIDE)  # writes off the map are dropped
     changed = Mobs(
         position=mobs.position.at[slot].set(where, mode="drop"),
         health=mobs.health.at[slot].set(kept.health, mode="drop"),
@@ -236,11 +238,11 @@ def _balance_kind(
 
 
 def _grow(world: EnvState, grown_before: Bool[Array, "P"]) -> EnvState:
-    """Let the plants near the agent age, unless a mob beside one tramples it down.
+    """Let the plants near the agent age, unless a mob next to one tramples it.
 
     Args:
       world: the world.
-      grown_before: which plants were there before this step; others age from the next one on.
+      grown_before: which plants existed before this step; new ones age from the next step on.
     """
     places, planted = world.growing_plants_positions, world.growing_plants_mask
     near = jnp.abs(places - world.player_position).sum(axis=1) < AGING_DISTANCE
@@ -252,7 +254,7 @@ def _grow(world: EnvState, grown_before: Bool[Array, "P"]) -> EnvState:
     age = jnp.where(active, world.growing_plants_age + 1, world.growing_plants_age)
     plant = jnp.where(age >= RIPE_AGE, BlockType.RIPE_PLANT.value, BlockType.PLANT.value)
     block = jnp.where(trampled, BlockType.GRASS.value, plant)
-    rows = jnp.where(planted, places[:, 0], SIDE)  # what is off the map is not written
+    rows = jnp.where(planted, places[:, 0], SIDE)  # writes off the map are dropped
     return world.replace(
         map=world.map.at[rows, places[:, 1]].set(block, mode="drop"),
         growing_plants_age=jnp.where(trampled, 0, age),
@@ -261,6 +263,6 @@ def _grow(world: EnvState, grown_before: Bool[Array, "P"]) -> EnvState:
 
 
 def _in_front(world: EnvState) -> Int[Array, "2"]:
-    """The cell that the agent faces, or at the edge of the map the one it stands on."""
+    """The cell that the agent faces, or at the edge of the map the cell it stands on."""
     cell = world.player_position + game_logic.DIRECTIONS[world.player_direction]
     return jnp.clip(cell, 0, SIDE - 1)

@@ -1,7 +1,7 @@
-"""Sets of cells of Crafter's map, and the search for the cheapest way on it.
+"""Sets of cells of Crafter's map as bitboards, and the search for cheapest paths on it.
 
-A set of cells is a board of two words of 32 bits for each of the 64 rows, so that a round of a search moves
-the whole front with a few shifts. This makes it cheap enough to plan anew at every step of many episodes.
+A set of cells is a board of two 32-bit words for each of the 64 rows, so that a round of a search moves the
+whole front with a few shifts. This is cheap enough to replan at every step of many episodes.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from envs.episodes import anyone
 
 WORD = 32
 Board: TypeAlias = UInt32[Array, "2 64"]
-"""Bit ``b`` of word ``[w, r]`` is the cell in row ``r`` and column ``32 w + b``."""
+"""A set of cells: bit ``b`` of word ``[w, r]`` is the cell in row ``r`` and column ``32 w + b``."""
 Cell: TypeAlias = Int[Array, "2"]
-"""Row and column, which may lie outside of the map."""
+"""The row and column of a cell, which may be outside of the map."""
 
 MOVES = np.array([(0, -1), (0, 1), (-1, 0), (1, 0)], np.int32)
-"""The neighbors of a cell: west, east, north, south, as the actions 1 to 4 move."""
+"""The directions of a cell's neighbors: west, east, north, south, in the order of the actions 1 to 4."""
 
 
 def pack(cells: Bool[Array, "64 64"]) -> Board:
@@ -43,7 +43,7 @@ def nowhere() -> Board:
 
 
 def single(cell: Cell) -> Board:
-    """The board of one cell; empty if that lies outside of the map."""
+    """The board of one cell; empty if the cell is outside of the map."""
     return pack_window(jnp.ones((1, 1), bool), cell)
 
 
@@ -54,9 +54,9 @@ def rectangle(center: Cell, down: int, right: int) -> Board:
 
 
 def pack_window(cells: Bool[Array, "*kinds R C"], corner: Cell) -> UInt32[Array, "*kinds 2 64"]:
-    """The boards of booleans in a window of the map with its first cell at ``corner``.
+    """The boards of booleans in a window of the map whose first cell is at ``corner``.
 
-    The window has at most 32 columns. What lies outside of the map is left out.
+    The window has at most 32 columns. Its part outside of the map is ignored.
     """
     num_rows, num_columns = cells.shape[-2:]
     columns = jnp.arange(num_columns, dtype=jnp.uint32)
@@ -68,14 +68,14 @@ def pack_window(cells: Bool[Array, "*kinds R C"], corner: Cell) -> UInt32[Array,
 
 
 def _shifted(words: UInt32[Array, "*rows"], by: Int[Array, ""]) -> UInt32[Array, "*rows"]:
-    """Words shifted to the left, or to the right for negative numbers."""
+    """Words shifted to the left, or to the right if ``by`` is negative."""
     left = words << jnp.clip(by, 0, WORD - 1).astype(jnp.uint32)
     right = words >> jnp.clip(-by, 0, WORD - 1).astype(jnp.uint32)
     return jnp.where(jnp.abs(by) >= WORD, 0, jnp.where(by >= 0, left, right)).astype(jnp.uint32)
 
 
 def contains(board: Board, cell: Cell) -> Bool[Array, ""]:
-    """Whether a cell is on a board; no cell outside of the map is."""
+    """Whether a cell is on a board; False for cells outside of the map."""
     inside = jnp.all((cell >= 0) & (cell < SIDE))
     row, column = jnp.clip(cell, 0, SIDE - 1)
     return inside & ((board[column // WORD, row] >> (column % WORD).astype(jnp.uint32) & 1) == 1)
@@ -120,12 +120,12 @@ def dead_ends(barred: Board) -> Board:
 
 
 DIG, WADE = 2, 6
-LONGEST = 96  # a way that costs more is not found
-ROUNDS = 4  # of a search without asking whether it has ended
+LONGEST = 96  # largest cost of a path that is found
+ROUNDS = 4  # number of rounds between two checks for termination
 
 
 class Terrain(NamedTuple):
-    """Where one can walk; other cells are barred."""
+    """The cells that can be walked on, by cost; all other cells are barred."""
 
     free: Board
     """Cells that cost one step."""
@@ -136,31 +136,32 @@ class Terrain(NamedTuple):
 
 
 class Aims(NamedTuple):
-    """What a way leads to. To end at an aim of board ``a`` costs ``costs[a]``."""
+    """The possible ends of a path. Ending at a cell of board ``a`` costs ``costs[a]``."""
 
     boards: UInt32[Array, "A 2 64"]
     costs: Int[Array, "A"]
 
 
 class _Search(NamedTuple):
-    """A search from the aims towards the walker, in rounds of one step each."""
+    """The state of a search from the aims towards the walker, in rounds of one step each."""
 
     time: Int[Array, ""]
     goes_on: Bool[Array, ""]
-    """Whether any search of the batch has not ended."""
+    """Whether any search of the batch is not done yet."""
     reached: tuple[Board, ...]
-    """Cells beside the front, as it was one round ago, two rounds ago and so on."""
+    """The cells next to the front, as it was one round ago, two rounds ago and so on."""
     found: Board
-    """The walker's neighbors that the front came to first."""
+    """The walker's neighbors that the front reached first."""
 
 
 def first_steps(
     here: Cell, aims: Aims, terrain: Terrain, needed: Bool[Array, ""]
 ) -> Bool[Array, "4"]:
-    """Which neighbors of ``here`` begin a cheapest way to an aim.
+    """Which neighbors of ``here`` are on a cheapest path to an aim.
 
-    An aim is entered at no other cost than its own, whatever the terrain. Under ``vmap`` all searches run
-    until the last one that is ``needed`` has ended. None if no aim can be reached within ``LONGEST``.
+    Entering an aim costs only ``Aims.costs``, whatever the terrain there. The result is all False if no aim
+    can be reached within a cost of ``LONGEST``. Under ``vmap`` all searches run until the last one that is
+    ``needed`` is done.
     """
     neighbors = spread(single(here)) & ~single(here)
 

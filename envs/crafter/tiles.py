@@ -1,9 +1,9 @@
 """Crafter's picture of an observation, drawn from its codes.
 
-Every cell of the view shows a tile that follows from its code alone, the light and whether the agent
-sleeps; every item shows its icon and its count. So a picture is a few look-ups in tables, which are made
+Every cell of the view shows a tile that depends only on its code, the light and whether the agent sleeps;
+every item shows its icon and its count. A picture therefore takes a few look-ups in tables, which are made
 once from Crafter's textures with the arithmetic of its renderer. Crafter also adds random noise to dark
-pictures. There is none here, so that a picture is exactly its codes.
+pictures. That noise is omitted here, so that a picture is a function of the codes.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from envs.crafter.view import (
     ROWS,
 )
 
-PIXELS = 64  # of a side of the picture that agents get, of which the last row and column are black
-UNIT = PIXELS // COLUMNS  # pixels of a side of a cell in it
-ITEM_ROWS = 2  # of icons below the view
-OUTSIDE = 127  # the gray of what is off the map
+PIXELS = 64  # side of the picture that agents observe, of which the last row and column are black
+UNIT = PIXELS // COLUMNS  # side of a cell in that picture, in pixels
+ITEM_ROWS = 2  # number of rows of icons below the view
+OUTSIDE = 127  # gray level of cells off the map
 NIGHT, SLEEP = np.array([0, 16, 64]), np.array([0, 0, 16])
-GRAY = np.array([19595, 38470, 7471])  # shares of red, green and blue in gray, of 65536
+GRAY = np.array([19595, 38470, 7471])  # weights of red, green and blue in gray, of 65536
 
-# Crafter's order of the items, and its names of textures where they are not those of blocks.
+# Crafter's order of the items, and its names of textures if they differ from those of the blocks.
 ITEMS = (*COUNTS[12:], "sapling", *COUNTS[:5], *COUNTS[6:12])
 TEXTURE = {"invalid": "unknown", "crafting_table": "table", "plant": "grass", "ripe_plant": "grass"}
 ON_BLOCK = {"plant": "plant", "ripe_plant": "plant-ripe"}
@@ -49,14 +49,14 @@ PLAYER = ("player-left", "player-right", "player-up", "player-down", "player-sle
 
 
 class Tiles(NamedTuple):
-    """The tables that pictures are made of, for cells of ``u`` pixels."""
+    """The tables from which pictures are made, for cells of ``u`` pixels."""
 
     day: UInt8[np.ndarray, "codes u u 3"]
-    """Of every cell code."""
+    """The tile of every cell code by day."""
     player: UInt8[np.ndarray, "5 blocks u u 3"]
     """The agent facing west, east, north, south, or asleep, on every block."""
     items: UInt8[np.ndarray, "16 10 u u 3"]
-    """In the order of the observation's counts, for every count."""
+    """The icon of every item, in the order of the observation's counts, with every count."""
 
 
 @cache
@@ -80,7 +80,7 @@ def tiles(unit: int = UNIT) -> Tiles:
 
 
 def picture(obs: Float[Array, "O"], unit: int = UNIT) -> UInt8[Array, "height width 3"]:
-    """What Crafter draws at an observation: the view, and below it the items, ``[9 u, 9 u, 3]`` bytes."""
+    """Crafter's picture of an observation: the view, and below it the items, ``[9 u, 9 u, 3]`` bytes."""
     table, dark = tiles(unit), night_tiles(unit)
     codes = obs[:NUM_CELLS].astype(jnp.int32)
     facing = jnp.argmax(obs[NUM_CELLS + NUM_COUNTS :][:NUM_FACINGS])
@@ -108,12 +108,12 @@ def picture(obs: Float[Array, "O"], unit: int = UNIT) -> UInt8[Array, "height wi
 
 
 def agent_picture(obs: Float[Array, "O"]) -> UInt8[Array, "64 64 3"]:
-    """The picture of 64 x 64 pixels that Crafter gives to agents; its last row and column are black."""
+    """The picture of 64 x 64 pixels that agents observe in Crafter; its last row and column are black."""
     return jnp.pad(picture(obs), ((0, PIXELS % COLUMNS), (0, PIXELS % COLUMNS), (0, 0)))
 
 
 class NightTiles(NamedTuple):
-    """``Tiles`` in the dark, before Crafter rounds to bytes."""
+    """``Tiles`` in the dark, before Crafter's rounding to bytes."""
 
     day: Float[np.ndarray, "codes u u 3"]
     player: Float[np.ndarray, "5 blocks u u 3"]
@@ -121,7 +121,7 @@ class NightTiles(NamedTuple):
 
 @cache
 def night_tiles(unit: int) -> NightTiles:
-    """The tiles without most of their color and with a tint of blue."""
+    """The tiles at night, with little of their color and a tint of blue."""
 
     def darkened(some: UInt8[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         flat = some.reshape(-1, unit, 3)
@@ -132,13 +132,13 @@ def night_tiles(unit: int) -> NightTiles:
 
 
 def _item_order() -> Int[np.ndarray, "16"]:
-    """The place of each of Crafter's items among the counts of an observation."""
+    """The index of each of Crafter's items among the counts of an observation."""
     return np.array([COUNTS.index(name) for name in ITEMS])
 
 
 @cache
 def _texture(name: str, size: int) -> UInt8[np.ndarray, "size size channels"]:
-    """A texture of Crafter with its channels, of which the fourth is its opacity if it has one."""
+    """A texture of Crafter, with opacity as an optional fourth channel."""
     with Image.open(texture_folder() / f"{name}.png") as image:
         return np.asarray(image.resize((size, size), resample=Image.Resampling.NEAREST))
 
@@ -151,7 +151,7 @@ def _block(name: str, unit: int) -> UInt8[np.ndarray, "u u 3"]:
 
 
 def _item(name: str, count: int, unit: int) -> UInt8[np.ndarray, "u u 3"]:
-    """An icon and its count, on black; nothing for nothing."""
+    """The icon of an item and its count, on black; all black if the count is 0."""
     tile = np.zeros((unit, unit, 3), np.uint8)
     if count:
         for what, share, offset in ((name, 0.8, 0.1), (str(count), 0.6, 0.4)):
@@ -162,7 +162,7 @@ def _item(name: str, count: int, unit: int) -> UInt8[np.ndarray, "u u 3"]:
 
 
 def _over(below: UInt8[np.ndarray, "h w 3"], texture: np.ndarray) -> UInt8[np.ndarray, "h w 3"]:
-    """A texture on something, in Crafter's arithmetic."""
+    """Draw a texture over a background, in Crafter's arithmetic."""
     if texture.shape[-1] < 4:
         return texture
     share = texture[..., 3:].astype(np.float32) / 255

@@ -1,8 +1,8 @@
-"""What is in view: Crafter's names, and an observation as the codes of what is drawn.
+"""The agent's view: Crafter's names, and an observation as the codes of everything that Crafter draws.
 
 An observation is 85 numbers: the codes of the 7 x 9 cells in view, row by row, then sixteen counts
 (inventory and needs), the direction that the agent faces (one-hot), the light and whether the agent sleeps,
-in Craftax's order. A cell's code is ``block + 17 * (mob + 4 * arrow)``.
+in Craftax's order. The code of a cell is ``block + 17 * (mob + 4 * arrow)``.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ COUNTS = (
 
 NUM_ACTIONS, NUM_ACHIEVEMENTS = len(ACTIONS), len(ACHIEVEMENTS)
 NUM_BLOCKS, NUM_MOBS, NUM_ARROWS = len(BLOCKS), len(MOBS), len(ARROWS)
-ROWS, COLUMNS = 7, 9  # of the view
+ROWS, COLUMNS = 7, 9  # size of the view in cells
 NUM_CELLS = ROWS * COLUMNS
 NUM_CODES = NUM_BLOCKS * NUM_MOBS * NUM_ARROWS
 NUM_COUNTS, MAX_COUNT = len(COUNTS), 9
 NUM_FACINGS = 4  # west, east, north, south
 OBS_SIZE = NUM_CELLS + NUM_COUNTS + NUM_FACINGS + 2
-LIGHT, ASLEEP = OBS_SIZE - 2, OBS_SIZE - 1  # places in an observation
+LIGHT, ASLEEP = OBS_SIZE - 2, OBS_SIZE - 1  # indices in an observation
 LAYOUT = ObsLayout(
     num_cells=NUM_CELLS,
     code_sizes=(NUM_BLOCKS, NUM_MOBS, NUM_ARROWS),
@@ -44,7 +44,7 @@ LAYOUT = ObsLayout(
 
 
 def observe(world: EnvState) -> Float[Array, "O"]:
-    """What the agent sees of a world: 63 cell codes and 22 numbers."""
+    """The agent's observation of a world: 63 cell codes and 22 numbers."""
     bag = world.inventory
     counts = [getattr(bag, name) for name in COUNTS[:12]]
     counts += [world.player_health, world.player_food, world.player_drink, world.player_energy]
@@ -63,7 +63,7 @@ def cell_codes(world: EnvState) -> Int[Array, "63"]:
     blocks = jnp.where(on_map, blocks, BlockType.OUT_OF_BOUNDS.value).ravel()
 
     def marked(things: Mobs, marks: Int[Array, "M"]) -> Int[Array, "63"]:
-        """The largest mark of the things on each cell, 0 where there is none."""
+        """The largest mark of the things on each cell, 0 if there are none."""
         place = things.position - corner
         shown = jnp.all((place >= 0) & (place < jnp.array([ROWS, COLUMNS])), axis=1) & things.mask
         cell = jnp.where(shown, place[:, 0] * COLUMNS + place[:, 1], NUM_CELLS)

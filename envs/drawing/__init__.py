@@ -1,4 +1,4 @@
-"""What the pictures of all worlds share: the record of what a world draws, marks, colors and GIFs."""
+"""Drawing code shared by all worlds: the record of a world's pictures, marks, colors and GIFs."""
 
 from __future__ import annotations
 

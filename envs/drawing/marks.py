@@ -1,6 +1,6 @@
-"""Labeled discs and boxes in units of cells, and room for those that would hide each other.
+"""Labeled discs and boxes in units of cells, and a layout in which they do not hide each other.
 
-Rows count downwards: letters stand upright on axes whose y grows towards the bottom.
+Rows are counted downwards: letters are upright on axes whose y axis points down.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ FONT = FontProperties(family="DejaVu Sans", weight="bold")
 def draw_disc(
     ax: Axes, label: str, color: str, x: float, y: float, size: float, filled: bool = True
 ) -> None:
-    """A disc in its color, or (not ``filled``) a ring of that color around a dark letter."""
+    """Draw a filled disc, or (not ``filled``) a ring around a dark letter."""
     disc = Circle((x, y), RADIUS * size, facecolor=color, edgecolor=PAPER, linewidth=0.8)
     if not filled:
         disc.set(radius=0.9 * RADIUS * size, facecolor=PAPER, edgecolor=color, linewidth=1.6)
@@ -30,7 +30,7 @@ def draw_disc(
 
 
 def draw_box(ax: Axes, label: str, color: str, x: float, y: float, size: float) -> None:
-    """A box with round corners."""
+    """Draw a box with round corners."""
     half = 0.9 * RADIUS * size
     style = f"round,pad=0,rounding_size={0.25 * size}"
     box = FancyBboxPatch(
@@ -41,7 +41,8 @@ def draw_box(ax: Axes, label: str, color: str, x: float, y: float, size: float) 
 
 
 def draw_leader(ax: Axes, home: np.ndarray, center: np.ndarray) -> None:
-    """A thin line from the cell ``[2]`` that a mark belongs to, to where it is drawn ``[2]``."""
+    """Draw a thin line from the cell ``[2]`` that a mark belongs to, to the place ``[2]`` where it is
+    drawn."""
     rows, columns = np.stack([home, center], axis=1)
     line = Line2D(columns, rows, color=INK, linewidth=0.8, zorder=2.5)
     line.set(marker="o", markersize=2.5, markevery=[0])
@@ -51,12 +52,12 @@ def draw_leader(ax: Axes, home: np.ndarray, center: np.ndarray) -> None:
 def spread_apart(
     homes: np.ndarray, heavy: np.ndarray, gap: float, limits: tuple[float, float]
 ) -> np.ndarray:
-    """Points ``[n, 2]`` near their homes, some ``gap`` from each other and within ``limits``.
+    """Move points ``[n, 2]`` away from their homes until they are ``gap`` apart, within ``limits``.
 
-    Points push each other away until none overlap; those with room around them stay at home, and
-    ``heavy`` ones give way last.
+    Points push each other away until none overlap. Those with room around them stay at home, and ``heavy``
+    ones are moved last.
     """
-    # Equal points start apart, each in a direction of its own.
+    # Equal points are first moved apart, each in a different direction.
     index = np.arange(len(homes))
     equal = np.all(homes[:, None] == homes[None], axis=-1)
     angle = np.pi + 2.4 * index

@@ -1,4 +1,4 @@
-"""Colors of all pictures: the color-blind-safe palette of Okabe and Ito, and the grays around it."""
+"""The colors of all pictures: the color-blind-safe palette of Okabe and Ito, and grays."""
 
 from __future__ import annotations
 
@@ -18,6 +18,6 @@ BAR_COLOR = "#C9CED2"
 
 
 def ink_on(color: str) -> str:
-    """Black or white, whichever stands out more from a color."""
+    """Black or white, whichever has more contrast to a color."""
     luminance = np.dot(to_rgb(color), (0.299, 0.587, 0.114))
     return INK if luminance > 0.6 else PAPER

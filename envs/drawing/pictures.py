@@ -1,7 +1,7 @@
-"""What a world can draw, as functions of plain data.
+"""The pictures that a world can draw, as functions of plain data.
 
 Generic code runs the episodes, lays out the axes, writes the titles and saves the files. A world only
-draws, and only what it offers here.
+draws.
 """
 
 from __future__ import annotations
@@ -17,29 +17,29 @@ Goals = np.ndarray  # [k, G] the goals of a prompt; the last is usually the task
 
 
 class Shown(NamedTuple):
-    """Something to show: a prompt, and what the agent does under it."""
+    """The subject of a picture: a prompt, and an episode under it."""
 
     title: str
-    """What stands above its picture. On axes generic code writes it, in a video the world."""
+    """The title above the picture. On axes it is written by generic code, in a video by the world."""
     goals: Goals
     episode: Episode
-    """With numpy leaves: one episode, or for ``visits`` a batch of them."""
+    """One episode with numpy leaves; for ``visits`` a batch of them."""
 
 
 class Stage(NamedTuple):
-    """The best prompt that a search knows after some episodes."""
+    """The best prompt of a search after a number of episodes."""
 
     label: str
-    """Such as "20 episodes"."""
+    """The label of the stage, such as "20 episodes"."""
     goals: Goals
     return_: float
 
 
 class Pictures(NamedTuple):
-    """What a world draws; it leaves out what it does not draw.
+    """The pictures of a world; those that it does not draw are None.
 
-    A task is the world's record of one task, with numpy leaves. Functions that take axes get one for each
-    of the tasks, all in one figure, and may add a legend to that figure (``loc="outside lower center"``
+    A task is the world's record of one task, with numpy leaves. Functions that take axes are given one for
+    each task, all in the same figure, and may add a legend to that figure (``loc="outside lower center"``
     keeps it off the pictures).
     """
 
@@ -47,33 +47,35 @@ class Pictures(NamedTuple):
     """``(axes, tasks, prompts) -> None``: the prompts of several methods on each task. ``prompts[i]`` maps
     the color of a method to its goals ``[k, G]``."""
     search: Callable | None = None
-    """``(axes, tasks, searches) -> None``: how the prompt changes in the course of one search on each
-    task. ``searches[i]`` is a sequence of ``Stage``, drawn as rows."""
+    """``(axes, tasks, searches) -> None``: how the prompt changes during one search on each task.
+    ``searches[i]`` is a sequence of ``Stage``, drawn as rows."""
     visits: Callable | None = None
     """``(axes, tasks, shown) -> ScalarMappable | None``: where many episodes went under each prompt, in
-    colors that all axes share. What is returned becomes the color bar."""
+    colors that all axes share. The result is drawn as a color bar."""
     known: Callable | None = None
     """``(axes, tasks, shown, reached) -> ScalarMappable | None``: one episode under each prompt, on top of
-    what was seen until then. ``reached[i]`` are the goals ``[n, G]`` that all episodes before have reached.
-    What is returned becomes the color bar."""
+    what was known before. ``reached[i]`` are the goals ``[n, G]`` that all earlier episodes have reached.
+    The result is drawn as a color bar."""
     episodes: Callable | None = None
     """``(axes, tasks, shown) -> None``: one episode on each task as a still picture."""
     video: Callable | None = None
     """``(path, task, shown) -> None``: episodes on one task side by side as a GIF."""
     frame: Callable | None = None
-    """``(obs) -> [H, W, 3]`` bytes: what the world looks like at an observation. Generic code makes the
-    video of a world that offers only this."""
+    """``(obs) -> [H, W, 3]`` bytes: an image of the world at an observation. If a world has only this,
+    generic code makes its video."""
     another_order: bool = False
-    """Whether a video also shows the goals of the optimized prompt in another order, as in worlds whose
+    """Whether a video also shows the optimized prompt with its goals in another order, for worlds whose
     tasks are orders."""
     panel: tuple[float, float] = (2.0, 2.2)
-    """Inches that the picture of one task takes, with its title and its share of a legend."""
+    """Width and height in inches of the picture of one task, including its title and its share of a
+    legend."""
     row: Callable[[int], tuple[float, float]] = lambda num_goals: (0.2 * num_goals + 0.6, 0.24)
-    """Inches that a row of ``search`` takes whose prompt has that many goals."""
+    """``(num_goals) -> (width, height)`` in inches of a row of ``search`` whose prompt has that many
+    goals."""
 
 
 def observations(episode: Episode) -> np.ndarray:
-    """What was observed from the start to the end of one episode, ``[length + 1, ..]``."""
+    """The observations of one episode from its start to its end, ``[length + 1, ..]``."""
     trajectory = episode.trajectory
     before = np.asarray(trajectory.obs)[: int(trajectory.length)]
     return np.concatenate([before, np.asarray(episode.last_obs)[None]])

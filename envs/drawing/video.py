@@ -17,26 +17,26 @@ from envs.drawing.palette import INK, PAPER
 
 DPI = 100
 MAX_FRAMES = 120
-PALETTE_FRAMES = 10  # whose colors make the palette
+PALETTE_FRAMES = 10  # number of frames from whose colors the palette is made
 
 MAX_FILM_FRAMES = 75
-HEAD, LINE, BELOW = 22, 13, 18  # pixels of a headline, of a line of a title, and of a caption
-LETTER = 5.5  # pixels of a letter of a title, on average
-MIN_LETTERS = 12  # that a line of a title holds, however narrow its picture
-GAP = 0.01  # between films, as a share of the width
+HEAD, LINE, BELOW = 22, 13, 18  # heights in pixels of a headline, a line of a title, and a caption
+LETTER = 5.5  # average width in pixels of a letter in a title
+MIN_LETTERS = 12  # letters that fit into a line of a title, however narrow its picture
+GAP = 0.01  # between films, as a fraction of the width
 SPACE = 0.12  # inches between axes in a row
 
 
 def write_gif(path: Path, figure: Figure, show: Callable[[int], object], num_times: int) -> None:
-    """Write what ``figure`` looks like after ``show(time)``, at up to ``MAX_FRAMES`` of the times."""
+    """Write a GIF of ``figure`` after ``show(time)``, for up to ``MAX_FRAMES`` of the times."""
     canvas = FigureCanvasAgg(figure)
     frames = []
     for time in np.unique(np.linspace(0, num_times - 1, min(num_times, MAX_FRAMES)).round()):
         show(int(time))
         canvas.draw()
         frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
-    durations = [100] * (len(frames) - 1) + [1500]  # ms; the end stays on view
-    # One palette for all frames, without dithering: what stands still is stored once.
+    durations = [100] * (len(frames) - 1) + [1500]  # ms; the last frame is shown longer
+    # One palette for all frames and no dithering, so that parts which do not change are stored once.
     some = frames[:: max(1, len(frames) // PALETTE_FRAMES)]
     palette = Image.fromarray(np.concatenate(some)).quantize(256)
     images = [
@@ -49,7 +49,7 @@ def write_gif(path: Path, figure: Figure, show: Callable[[int], object], num_tim
 
 
 def axes_in_a_row(titles: Sequence[str], width: float, height: float) -> tuple[Figure, list[Axes]]:
-    """A figure of axes side by side, each of a size in inches, below their titles."""
+    """A figure of axes side by side below their titles, each of a given size in inches."""
     above = (_room_for(titles) + 5) / DPI
     whole = len(titles) * (width + SPACE) - SPACE, height + above
     figure = Figure(figsize=whole, dpi=DPI, facecolor=PAPER)
@@ -63,18 +63,19 @@ def axes_in_a_row(titles: Sequence[str], width: float, height: float) -> tuple[F
 
 
 class Film(NamedTuple):
-    """One episode of a video, made of pixels."""
+    """One episode of a video, as images."""
 
     title: str
     num_times: int
     frames: Callable[[np.ndarray], np.ndarray]
     """``(times [n]) -> [n, H, W, 3]`` bytes."""
     caption: Callable[[int], str]
-    """``(time)`` -> what stands below the picture."""
+    """``(time) -> text`` below the picture."""
 
 
 def write_films(path: Path, films: Sequence[Film], headline: str = "") -> None:
-    """Write films side by side at up to ``MAX_FILM_FRAMES`` times; one that ends earlier stands still."""
+    """Write films side by side, with up to ``MAX_FILM_FRAMES`` frames; one that ends earlier stops at its
+    end."""
     num_times = max(film.num_times for film in films)
     times = np.linspace(0, num_times - 1, min(num_times, MAX_FILM_FRAMES)).round().astype(int)
     times_of = [np.minimum(times, film.num_times - 1) for film in films]
@@ -105,5 +106,5 @@ def write_films(path: Path, films: Sequence[Film], headline: str = "") -> None:
 
 
 def _room_for(titles: Sequence[str]) -> int:
-    """Pixels that the longest of some titles takes."""
+    """The height in pixels of the longest title."""
     return LINE * max(title.count("\n") + 1 for title in titles)

@@ -1,4 +1,4 @@
-"""GridWorld: switch on objects in an order that is not told. Nothing here imports jax."""
+"""GridWorld: switch on objects in a hidden order. Nothing here imports jax."""
 
 from __future__ import annotations
 
@@ -52,6 +52,6 @@ GRIDWORLD = World(
     },
     pictures=load_pictures,
     page=load_page,
-    # Episodes start on a random cell, so one return says little about a prompt.
+    # Episodes start on a random cell, so a single return says little about a prompt.
     judged=Judgement(mode="greedy", episodes=10),
 )

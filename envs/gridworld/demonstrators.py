@@ -1,6 +1,6 @@
-"""The demonstrator of GridWorld: it knows the order (paper, appendix C.3).
+"""The demonstrator of GridWorld, which knows the order (paper, appendix C.3).
 
-It walks to the next object of the task and switches it on; where both rows and columns are left to go,
+It walks to the next object of the task and switches it on. If it has to move along both rows and columns,
 it chooses the axis at random, as the authors' expert does.
 """
 
@@ -65,6 +65,7 @@ def grid_demonstrators(env: GridWorld) -> dict[str, Demonstrator]:
 
 
 def perfect_return(trajectory: Trajectory) -> Float[Array, ""]:
-    """1: whatever was switched on in an episode is a task that the episode solves."""
+    """The return in hindsight: always 1, since the objects that were switched on are a task that it
+    solves."""
     del trajectory
     return jnp.ones(())

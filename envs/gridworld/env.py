@@ -1,9 +1,9 @@
-"""GridWorld: switch on objects in an order that the task goal does not tell.
+"""GridWorld: switch on objects in an order that the task goal does not reveal.
 
-Paper, appendix C.3; sizes, places and the rule of the reward are those of the authors' code. Rows
-count downwards, columns to the right; north is row - 1. The observation is
-``(state of each of the 7 objects, row, column)``, not scaled. The task goal names the set of objects;
-a goal is the one object that was just switched on.
+Source: paper, appendix C.3; sizes, places and the reward rule are those of the authors' code. Rows are
+counted downwards, columns to the right; north is row - 1. The observation is ``(state of each of the 7
+objects, row, column)``, unscaled. The task goal is the set of objects; a goal is the one object that was
+just switched on.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ MOVES = ((0, -1), (-1, 0), (0, 1), (1, 0), (0, 0), (0, 0))
 SIDE = 10
 OBJECTS = ((9, 1), (8, 4), (1, 9), (3, 7), (3, 9), (6, 1), (8, 6))
 NUM_OBJECTS = len(OBJECTS)
-LETTERS = "ABCDEFG"  # their names
+LETTERS = "ABCDEFG"  # names of the objects
 MIN_SUBTASKS = 3
-NONE = -1  # fills an order of fewer than 7 objects
+NONE = -1  # padding of orders with fewer than 7 objects
 
 
 class GridTask(NamedTuple):
     """Which objects to switch on, and in which order."""
 
     order: Int[Array, "*batch O"]
-    """Indices into ``OBJECTS``, then ``NONE`` up to 7 places."""
+    """Indices into ``OBJECTS``, padded with ``NONE`` to 7 places."""
 
 
 class GridState(NamedTuple):
@@ -44,11 +44,11 @@ class GridState(NamedTuple):
     position: Int[Array, "2"]
     is_on: Bool[Array, "O"]
     was_on: Bool[Array, "O"]
-    """Objects that have been switched on at least once."""
+    """Which objects have been switched on at least once."""
     newly_on: Bool[Array, "O"]
-    """The object that the last step switched on for the first time, if it did."""
+    """Which object, if any, the last step switched on for the first time."""
     num_solved: Int[Array, ""]
-    """Subtasks completed in order."""
+    """Number of subtasks completed in order."""
     steps: Int[Array, ""]
     done: Bool[Array, ""]
 
@@ -82,7 +82,7 @@ class GridWorld(Environment):
         return self.task(jax.random.randint(key, (), 0, self.num_tasks))
 
     def task(self, index: Int[Array, ""]) -> GridTask:
-        """The tasks in a fixed order, over and over again: shorter ones first."""
+        """The task with an index in a fixed enumeration, shorter ones first, which repeats endlessly."""
         return GridTask(order=jnp.asarray(_all_orders())[index % self.num_tasks])
 
     def sample_goal(self, key: PRNGKeyArray) -> Float[Array, "G"]:
@@ -90,7 +90,7 @@ class GridWorld(Environment):
 
     @property
     def goal_set(self) -> np.ndarray:
-        """The objects."""
+        """One goal for each object."""
         return np.eye(NUM_OBJECTS, dtype=np.float32)
 
     def expert_goal(self, state: GridState, num_steps: int) -> Float[Array, "G"]:
@@ -109,18 +109,19 @@ class GridWorld(Environment):
         return jnp.ones(())
 
     def solvable(self, task: GridTask) -> Bool[Array, ""]:
-        """Whether the horizon has room for the order from the best start, which is its first object."""
+        """Whether the order fits into the horizon from the best start, which is the order's first
+        object."""
         return self._fewest_steps(task) <= self.horizon
 
     def _fewest_steps(self, task: GridTask) -> Int[Array, ""]:
-        """Steps from the first object on: the way to each next one, and a flip of each."""
+        """Steps from the first object on: the walk to each next object, and a flip of each."""
         places = jnp.asarray(OBJECTS)[task.order]
         ways = jnp.abs(places[1:] - places[:-1]).sum(axis=1)
         real = task.order != NONE
         return jnp.sum(jnp.where(real[1:], ways, 0)) + jnp.sum(real)
 
     def num_parts(self, task: GridTask) -> Int[Array, ""]:
-        """The objects of the task."""
+        """The number of objects in the task."""
         return jnp.sum(task.order != NONE)
 
     def fingerprint(self, task: GridTask) -> Int[Array, "F"]:
@@ -181,8 +182,8 @@ class GridWorld(Environment):
         order, num_solved = state.task.order, state.num_solved
         num_subtasks = jnp.sum(order != NONE)
         place = jnp.arange(NUM_OBJECTS)
-        # The reward is due when the solved objects and the next one are on and, of the task's objects, no
-        # later one is.
+        # The reward is paid when the solved objects and the next one are on, and none of the task's later
+        # objects is.
         in_order = jnp.all((is_on[order] == (place <= num_solved)) | (place >= num_subtasks))
         num_solved += in_order
         steps = state.steps + 1

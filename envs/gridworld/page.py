@@ -1,4 +1,4 @@
-"""What GridWorld brings to HTML pages."""
+"""GridWorld's part of HTML pages."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from envs.page import Page
 
 
 def grid_page(env: GridWorld) -> Page:
-    """The rules, and the grid with its objects."""
+    """The rules of the world, and the drawing of the grid with its objects."""
     return Page(
         script=Path(__file__).with_name("page.js"),
         facts={
@@ -30,5 +30,5 @@ def grid_page(env: GridWorld) -> Page:
 
 
 def order_of(task: Task) -> list[int]:
-    """The objects of a task in their order."""
+    """The objects of a task, in order."""
     return [int(thing) for thing in np.asarray(task.order) if thing != NONE]

@@ -1,7 +1,7 @@
 """Pictures of GridWorld: how a search finds the hidden order, episodes, and GIFs of them.
 
-Positions are (row, column). Objects go by the letters A to G, each in a color of its own; orders and
-prompts are arrays of their indices.
+Positions are (row, column). Objects are labeled A to G, each in its own color; orders and prompts are
+arrays of their indices.
 """
 
 from __future__ import annotations
@@ -40,26 +40,26 @@ from envs.drawing.video import axes_in_a_row, write_gif
 from envs.gridworld.env import LETTERS, NONE, NUM_OBJECTS, OBJECTS, SIDE, GridWorld
 
 OBJECT_COLORS = (ORANGE, BLUE, GREEN, YELLOW, PURPLE, SKY, VERMILION)
-UNKNOWN = "?"  # a goal that names no single object
+UNKNOWN = "?"  # label of a goal that is not a single object
 NO_GOALS = "task goal only"
 TIME_COLORS = LinearSegmentedColormap.from_list("time", ["#C3CACE", INK])
 
 OBJECT_SIZE, SPARE_SIZE, PLACE_SIZE, START_SIZE, GOAL_SIZE = 0.95, 0.7, 0.62, 0.7, 0.72
 CELLS = np.array(OBJECTS, float)
-PLACE_SHIFT = np.array([-0.62, 0.62])  # from an object to its place in the order
-ROOM = 0.6  # cells around the grid that marks of its edge reach into
-STRIP = 1.5  # cells below the grid that the prompt takes
-LANE, NUM_LANES = 0.12, 5  # distance in cells of the lanes that legs of a walk take in turn
-STRIP_INDENT = 2.5  # where its goals begin
+PLACE_SHIFT = np.array([-0.62, 0.62])  # from an object to the label of its place in the order
+ROOM = 0.6  # margin around the grid in cells, for marks at its edge
+STRIP = 1.5  # height of the prompt's strip below the grid, in cells
+LANE, NUM_LANES = 0.12, 5  # distance in cells between the lanes that legs of a walk use in turn
+STRIP_INDENT = 2.5  # column at which the goals in the strip begin
 
-UNIT = 0.19  # inches from goal to goal of a prompt in the picture of a search
-ROW = 1.2  # distance of its rows, in units
-RETURN_ROOM = 1.9  # units that its column of returns takes
+UNIT = 0.19  # distance in inches between the goals of a prompt in the picture of a search
+ROW = 1.2  # distance between rows of that picture, in units
+RETURN_ROOM = 1.9  # width of the column of returns, in units
 
 
 def grid_pictures(env: GridWorld) -> Pictures:
     """The orders that a search tried, episodes under its prompts, and a GIF of one task."""
-    del env  # all sizes look the same
+    del env  # the pictures do not depend on it
 
     def row(num_goals: int) -> tuple[float, float]:
         return UNIT * (max(NUM_OBJECTS, num_goals - 1) + RETURN_ROOM), UNIT * ROW
@@ -93,7 +93,7 @@ def draw_searches(
 
 
 def draw_episodes(axes: Sequence[Axes], tasks: Sequence[Task], shown: Sequence[Shown]) -> None:
-    """An episode on each task, with the objects that were switched on in turn as full discs."""
+    """An episode on each task; the objects that were switched on in order are drawn as filled discs."""
     for ax, task, (_, goals, episode) in zip(axes, tasks, shown, strict=True):
         objects = objects_of(task.order)
         num_solved = round(float(episode.return_) * len(objects))
@@ -135,19 +135,19 @@ class Panel(NamedTuple):
     title: str
     walk: Walk
     prompt: np.ndarray | None = None
-    """``[k]`` objects that the goals of a prompt name, for a strip below the grid."""
+    """``[k]``: the objects that the goals of a prompt name, for a strip below the grid."""
 
 
 def walk_of(episode: Episode) -> Walk:
-    """The start of one episode and the world after each of its steps."""
+    """The walk of one episode: its start and the world after each step."""
     seen = observations(episode)
     return Walk(seen[:, NUM_OBJECTS:].astype(int), seen[:, :NUM_OBJECTS] > 0.5)
 
 
 def named_objects(goals: np.ndarray, order: np.ndarray) -> np.ndarray:
-    """The objects that the goals ``[k, 7]`` of a prompt name, without a last goal that is the task goal.
+    """The objects that the goals ``[k, 7]`` of a prompt name, except for a last goal that is the task goal.
 
-    A goal counts as the object that it is nearest to, since some methods move goals. A goal that is not
+    Since some methods move goals, a goal counts as the object that it is nearest to. A goal that is not
     nearest to a single object is ``NONE``.
     """
     near = goals > 0.5
@@ -158,9 +158,9 @@ def named_objects(goals: np.ndarray, order: np.ndarray) -> np.ndarray:
 
 
 def in_turn(objects: np.ndarray, order: np.ndarray) -> np.ndarray:
-    """Which of the ``objects [k]`` that a prompt names come in their turn, ``[k]`` booleans.
+    """Which of the ``objects [k]`` that a prompt names are in order, ``[k]`` booleans.
 
-    Read alone, those spell the beginning of the true order ``[n]``.
+    Together these objects are a prefix of the true order ``[n]``.
     """
     place, turns = 0, []
     for thing in objects.tolist():
@@ -170,14 +170,15 @@ def in_turn(objects: np.ndarray, order: np.ndarray) -> np.ndarray:
 
 
 def objects_of(order: np.ndarray) -> np.ndarray:
-    """The objects of a task ``[7]`` in their order, ``[n]``."""
+    """The n objects of a task ``[7]``, in order, without padding."""
     return order[order != NONE]
 
 
 def draw_objects(
     ax: Axes, objects: np.ndarray, filled: np.ndarray, y: float, x: float = 0.0
 ) -> None:
-    """A row of discs for objects ``[k]``, one apart from ``x`` on; those not ``filled [k]`` are rings."""
+    """Draw a row of discs for objects ``[k]``, from ``x`` on; those that are not ``filled [k]`` are
+    rings."""
     for index, (thing, is_filled) in enumerate(zip(objects, filled, strict=True)):
         known = thing != NONE
         label, color = (LETTERS[thing], OBJECT_COLORS[thing]) if known else (UNKNOWN, BAR_COLOR)
@@ -192,15 +193,15 @@ def draw_grid(
     prompt: np.ndarray | None = None,
     lanes: bool = True,
 ) -> None:
-    """Draw the objects with their places in the true order, and what happens among them.
+    """Draw the objects with their places in the true order, and an episode.
 
     Args:
-      ax: where to draw; its ticks and frame are removed.
+      ax: the axes to draw on; their ticks and frame are removed.
       order: ``[7]`` the task; objects that are not in it are gray.
-      filled: ``[7]`` objects drawn as full discs, the others are rings.
+      filled: ``[7]`` objects to draw as filled discs; the others are rings.
       walk: an episode, drawn as a line from its start S, from light to dark.
       prompt: ``[k]`` objects that the goals of a prompt name, for a strip below the grid.
-      lanes: whether legs of the walk that share cells run side by side.
+      lanes: whether to draw legs of the walk that share cells side by side.
     """
     edges = np.arange(SIDE + 1) - 0.5
     ax.add_patch(Rectangle((-0.5, -0.5), SIDE, SIDE, facecolor=FREE_COLOR, linewidth=0, zorder=0))
@@ -220,7 +221,7 @@ def draw_grid(
 
 
 def grid_gif(path: Path, order: np.ndarray, panels: Sequence[Panel]) -> None:
-    """Write a short GIF of episodes of the task ``order [7]``; objects are full while they are on."""
+    """Write a short GIF of episodes on the task ``order [7]``; objects are filled while they are on."""
     has_strip = any(panel.prompt is not None for panel in panels)
     titles = [panel.title for panel in panels]
     figure, axes = axes_in_a_row(titles, 3.2, 3.5 if has_strip else 3.2)
@@ -232,7 +233,7 @@ def grid_gif(path: Path, order: np.ndarray, panels: Sequence[Panel]) -> None:
             ax.clear()
             draw_grid(ax, order, walk.is_on[now], so_far, prompt, lanes=False)
             row, column = walk.positions[now]
-            # A ring leaves the letter of an object readable.
+            # The agent is a ring, so that the letter of an object stays readable.
             ring = Circle((column, row), 0.75, fill=False, edgecolor=INK, linewidth=2.2, zorder=9)
             ax.add_patch(ring)
 
@@ -242,7 +243,7 @@ def grid_gif(path: Path, order: np.ndarray, panels: Sequence[Panel]) -> None:
 def _draw_search(
     ax: Axes, order: np.ndarray, rows: Sequence[np.ndarray], returns: Sequence[float], width: int
 ) -> None:
-    """The true order, and below it the prompt of each stage with its return."""
+    """Draw the true order, and below it the prompt of each stage with its return."""
     right = width + RETURN_ROOM - 0.6
     draw_objects(ax, order, np.ones(len(order), bool), 0.0)
     ax.axhline(0.5 * ROW, color=BAR_COLOR, linewidth=0.8)
@@ -273,7 +274,7 @@ def _draw_walk(ax: Axes, walk: Walk, lanes: bool) -> None:
 
 
 def _draw_start(ax: Axes, start: np.ndarray, order: np.ndarray) -> None:
-    """The start S, beside the objects and places that it would hide."""
+    """Draw the start S, next to objects and labels that it would hide."""
     taken = np.concatenate([CELLS, CELLS[objects_of(order)] + PLACE_SHIFT])
     homes = np.concatenate([taken, start[None]])
     heavy = np.arange(len(homes)) < len(taken)
@@ -304,7 +305,7 @@ def _draw_strip(ax: Axes, prompt: np.ndarray) -> None:
 
 
 def _legend(ax: Axes, entries: Mapping[str, Any], columns: int) -> None:
-    """Explain marks, or stacks of marks, below the figure that has these axes."""
+    """Add a legend of marks, or stacks of marks, below the figure that has these axes."""
     ax.figure.legend(
         list(entries.values()), list(entries), loc="outside lower center", ncols=columns,
         handler_map={tuple: HandlerTuple(ndivide=1)},

@@ -1,8 +1,8 @@
-"""Franka Kitchen: a robot arm opens doors and turns switches in an order that it is not told.
+"""Franka Kitchen: a robot arm opens doors and turns switches in a hidden order.
 
-Four worlds with the same tasks and one policy. ``kitchen`` is a reduced scene and chooses its physics
-engine by the machine; ``kitchen-mjx`` and ``kitchen-native`` name the engine; ``kitchen-stock`` is the full
-scene of gymnasium-robotics. Nothing here imports jax or mujoco.
+There are four worlds with the same tasks and one policy. ``kitchen`` is a reduced scene whose physics
+engine depends on the machine; ``kitchen-mjx`` and ``kitchen-native`` are the same scene with a fixed
+engine; ``kitchen-stock`` is the full scene of gymnasium-robotics. Nothing here imports jax or mujoco.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ def make(name: str = "kitchen", backend: str = "auto", model: str = "reduced") -
     """The kitchen with an engine (``auto``, ``native`` or ``mjx``) and a model (``reduced`` or ``stock``).
 
     Raises:
-      MissingExtraError: if packages are missing or do not fit together.
-      NoOpenGLError: if the OpenGL that ``MUJOCO_GL`` names is missing.
+      MissingExtraError: if packages are missing or incompatible with each other.
+      NoOpenGLError: if the OpenGL backend that ``MUJOCO_GL`` names is missing.
     """
-    import_mujoco()  # complains now and not in the middle of a program
+    import_mujoco()  # raises errors now rather than while a program is traced
     from envs.kitchen.env import Kitchen
 
     return Kitchen(name=name, horizon=HORIZON, backend=backend, model=model)
@@ -89,7 +89,7 @@ KITCHEN = World(
     summary="a robot arm completes 1 to 5 subtasks in a kitchen in an order that is not told",
     demonstrators=load_demonstrators,
     presets={
-        # Trajectories are long, so that 32 of them are enough for a gradient step.
+        # Trajectories are long, so 32 of them are enough for a gradient step.
         "fast": {
             "steps": 5_000,
             "trajectories": 9_000,
@@ -113,7 +113,7 @@ KITCHEN = World(
     },
     pictures=load_pictures,
     page=load_page,
-    method_defaults={"spirl": {"target_divergence": 5.0}},  # that of SPiRL's own kitchen
+    method_defaults={"spirl": {"target_divergence": 5.0}},  # as for the kitchen in SPiRL's own code
     num_test_tasks=25,
     official=load_official,
 )

@@ -1,8 +1,8 @@
-"""Kinematics of the arm in JAX: where the fingertips are, how joints move them, and what gravity asks for.
+"""Kinematics of the arm in JAX: the pose of the fingertips, its Jacobian, and the torques against gravity.
 
-It needs only constants of the compiled model and no state of an engine, and costs a few small matrix
-products. The tip is a point between the finger pads; its frame has x along the pads, y along the opening
-of the fingers, z along the approach.
+This needs only constants of the compiled model and no state of an engine, and costs a few small matrix
+products. The tip is a point between the finger pads. The axes of its frame are x along the pads, y along
+the opening of the fingers, and z along the approach.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import mujoco
 
 GRAVITY = 9.81  # m/s^2
-PAD = 0.03  # m, from the site between the fingers to the middle of their pads
+PAD = 0.03  # m, from the site between the fingers to the center of their pads
 
 
 class Arm(NamedTuple):
@@ -28,30 +28,30 @@ class Arm(NamedTuple):
     base_position: Float[np.ndarray, "3"]
     base_rotation: Float[np.ndarray, "3 3"]
     positions: Float[np.ndarray, "7 3"]
-    """Of each link in its parent."""
+    """Position of each link in the frame of its parent."""
     rotations: Float[np.ndarray, "7 3 3"]
     masses: Float[np.ndarray, "7"]
     centers: Float[np.ndarray, "7 3"]
-    """Of mass, in the link; hand and fingers belong to the last."""
+    """Center of mass of each link in its own frame; hand and fingers are part of the last link."""
     tip_position: Float[np.ndarray, "3"]
-    """In the last link."""
+    """Position of the tip in the frame of the last link."""
     tip_rotation: Float[np.ndarray, "3 3"]
 
 
 class Pose(NamedTuple):
-    """The arm at some joint angles, in the world's frame; m and rad."""
+    """The pose of the arm at given joint angles, in the world's frame; m and rad."""
 
     tip: Float[Array, "3"]
     rotation: Float[Array, "3 3"]
-    """Of the tip."""
+    """Orientation of the tip."""
     jacobian: Float[Array, "6 7"]
-    """Linear and angular velocity of the tip by joint velocity."""
+    """Linear and angular velocity of the tip per joint velocity."""
     gravity: Float[Array, "7"]
-    """Torques that hold the arm, N m."""
+    """Torques that hold the arm against gravity, N m."""
 
 
 def make_arm(model: mujoco.MjModel) -> Arm:
-    """The constants of either model."""
+    """The constants of the arm in a model, which may be the reduced or the stock one."""
     mujoco = import_mujoco()
     data = mujoco.MjData(model)
     links = [model.body(f"panda0_link{number}") for number in range(1, 8)]
@@ -64,7 +64,7 @@ def make_arm(model: mujoco.MjModel) -> Arm:
     masses[-1] = model.body_mass[end].sum()
     center = model.body_mass[end] @ data.xipos[end] / masses[-1]
     centers[-1] = data.xmat[last].reshape(3, 3).T @ (center - data.xpos[last])
-    # The first link's pose in the world at angle 0: its parents are fixed.
+    # The pose of the first link in the world at angle 0, since its parents are fixed.
     first = links[0].id
     site = model.site("end_effector")
     tip_rotation = _matrix(site.quat)
@@ -98,14 +98,14 @@ def arm_pose(arm: Arm, angles: Float[Array, "7"]) -> Pose:
     tip = position + rotation @ arm.tip_position
     anchor, axis, center = jnp.stack(anchors), jnp.stack(axes), jnp.stack(centers)
     jacobian = jnp.concatenate([jnp.cross(axis, tip - anchor).T, axis.T])
-    # Moving joint i lifts all links from i on.
+    # Joint i lifts all links from i on.
     lift = jnp.cross(axis[:, None], center[None] - anchor[:, None])[..., 2]
     gravity = GRAVITY * jnp.sum(jnp.triu(lift) * arm.masses, axis=1)
     return Pose(tip=tip, rotation=rotation @ arm.tip_rotation, jacobian=jacobian, gravity=gravity)
 
 
 def turn(angle: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """The rotation about z."""
+    """The rotation matrix about z."""
     cos, sin, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros(()), jnp.ones(())
     return jnp.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one]).reshape(3, 3)
 

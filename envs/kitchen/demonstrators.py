@@ -2,14 +2,13 @@
 
 The paper trains one policy for each subtask with PPO and chains them (appendix C.2; neither the policies
 nor their data are public). Here every subtask is a short list of phases: move the arm to a pose in front of
-the object, approach, act along the arc of the object's joint, let go, retreat. Actions come from damped
-least squares on the arm's Jacobian, to which the torques against gravity are added. A phase ends early when
-the hand has lost its object, and a subtask that is not complete after its last phase starts again. Gaussian
-noise on all nine actions spreads the data. Without it some joints would follow the same path in every
-demonstration, and a policy would learn to rely on differences in their positions that are too small to
-matter.
+the object, approach, act along the arc of the object's joint, let go, retreat. Actions are computed by
+damped least squares from the arm's Jacobian, plus the torques against gravity. A phase ends early if the
+hand has lost its object, and a subtask that is not complete after its last phase is started again. Gaussian
+noise on all nine actions diversifies the data. Without it some joints would follow the same path in every
+demonstration, and a policy would learn to rely on irrelevantly small differences in their positions.
 
-The phases are in ``envs.kitchen.phases``; here is what carries them out.
+The phases are defined in ``envs.kitchen.phases``; this module executes them.
 """
 
 from __future__ import annotations
@@ -36,19 +35,19 @@ from envs.kitchen.phases import RETRY, Phase, Plan, make_plan
 from envs.kitchen.physics import CONTROL_PERIOD, MAX_SHIFT, MODELS, NUM_ROBOT
 
 NUM_JOINTS = 7
-NOISE = 0.08  # standard deviation on the actions of arm and fingers
+NOISE = 0.08  # standard deviation of the noise on the actions of arm and fingers
 
-# Angles of the seven joints, rad. The limits are a little inside of the joints' ranges and of the bounds of
-# the actuators' targets.
+# Limits for the angles of the seven joints, rad. They are slightly within the joints' ranges and the bounds
+# of the actuators' targets.
 LOW = np.array([-2.85, -1.755, -2.85, -3.02, -2.85, 0.02, -2.85])
 HIGH = np.array([2.85, 1.72, 2.85, -0.45, 2.85, 2.09, 2.85])
-# Six joints would do for a pose of the hand. What the seventh leaves free leads towards these angles.
+# A pose of the hand needs six joints. The redundant degree of freedom is used to move towards these angles.
 REST = np.array([0.148, -1.5, 1.7, -2.3, 0.3, 0.8, 1.6])
 DAMPING = 0.03
 MAX_TURN = 0.25  # rad in a step
 
-# Of the joint that each subtask moves: its place in the 30 positions of the scene, the body that it moves,
-# the sign of the motion, and whether it slides or turns.
+# The joint that each subtask moves: its index in the 30 positions of the scene, the body that it moves, the
+# sign of the motion, and whether it slides or turns.
 JOINTS = (11, 17, 19, 21, 22)
 BODIES = ("knob 2", "lightswitchroot", "slidelink", "hingerightdoor", "microdoorroot")
 SIGNS = (-1.0, -1.0, 1.0, 1.0, -1.0)
@@ -56,34 +55,34 @@ SLIDES = (False, False, True, False, False)
 
 
 class Scene(NamedTuple):
-    """Where the moving bodies are, in the world."""
+    """The poses of the objects' bodies in the world's frame."""
 
     positions: Float[np.ndarray, "S 3"]
     rotations: Float[np.ndarray, "S 3 3"]
-    """At joint position 0; joints turn about their z axis or slide along their x axis."""
+    """Orientations at joint position 0; joints turn about their z axis or slide along their x axis."""
 
 
 class Robot(NamedTuple):
-    """Constants that the demonstrator of one model computes with."""
+    """The constants of one model that the demonstrator uses."""
 
     scene: Scene
     arm: Arm
     stiffness: Float[np.ndarray, "7"]
-    """Of the position actuators of the joints, N m / rad."""
+    """Stiffness of the joints' position actuators, N m / rad."""
     reach: Float[np.ndarray, "7"]
-    """How far a joint gets in a control step, as a part of the way to its actuator's target."""
+    """How far a joint moves in a control step, as a fraction of the distance to its actuator's target."""
 
 
 class Sight(NamedTuple):
-    """What the demonstrator sees at a step."""
+    """The demonstrator's observation at a step."""
 
     positions: Float[Array, "30"]
-    """Of the full scene."""
+    """Joint positions of the full scene."""
     pose: Pose
 
     @property
     def angles(self) -> Float[Array, "7"]:
-        """Of the joints of the arm."""
+        """The angles of the arm's joints."""
         return self.positions[:NUM_JOINTS]
 
     @property
@@ -96,26 +95,26 @@ class Sight(NamedTuple):
 
 
 class Target(NamedTuple):
-    """Where the tip of the hand should be and how the hand should be held."""
+    """The target position of the tip and orientation of the hand."""
 
     point: Float[Array, "3"]
     rotation: Float[Array, "3 3"]
 
 
 class Memory(NamedTuple):
-    """Where the demonstrator is in its plan."""
+    """The demonstrator's place in its plan."""
 
     subtask: Int[Array, ""]
     phase: Int[Array, ""]
     clock: Int[Array, ""]
-    """Steps since the phase began."""
+    """Number of steps since the phase began."""
     tries: Int[Array, ""]
-    """How often it has tried the present subtask before."""
+    """Number of earlier tries of the current subtask."""
 
 
 @cache
 def make_scene(model_name: str) -> Scene:
-    """Poses of the objects' bodies in either model."""
+    """The poses of the objects' bodies in a model."""
     mujoco = import_mujoco()
     from envs.kitchen.model import load_model
 
@@ -131,7 +130,7 @@ def make_scene(model_name: str) -> Scene:
 
 @cache
 def make_robot(model_name: str) -> Robot:
-    """Scene and arm of either model."""
+    """The scene and the arm of a model."""
     import_mujoco()
     from envs.kitchen.model import load_model
 
@@ -146,7 +145,7 @@ def make_robot(model_name: str) -> Robot:
 
 
 def scripted_arm(env: Kitchen, noise: float = NOISE) -> Agent:
-    """The demonstrator; ``noise`` is the standard deviation on the nine actions."""
+    """The demonstrator; ``noise`` is the standard deviation of the noise on the nine actions."""
     plan, robot = make_plan(), make_robot(env.model)
 
     def begin(
@@ -176,13 +175,13 @@ def scripted_arm(env: Kitchen, noise: float = NOISE) -> Agent:
 
 
 def kitchen_demonstrators(env: Kitchen) -> dict[str, Demonstrator]:
-    """Those of a kitchen. All go through every ordered task in turn (paper: 300 tasks, 30 episodes each).
+    """The demonstrators of a kitchen, by name.
 
-    ``expert`` demonstrates in both scenes, with the reduced one's physics drawn for each episode. The
-    others demonstrate in one scene as it is, with one engine. A world that names MJX or the stock scene has
-    its own one first.
+    All demonstrate every ordered task in turn (paper: 300 tasks, 30 episodes each). ``expert`` demonstrates
+    in both scenes, with randomized physics in the reduced one. The others demonstrate in one unmodified
+    scene with one engine. In the worlds of MJX and of the stock scene their own demonstrator comes first.
     """
-    import_mujoco()  # complains now and not in the middle of a program
+    import_mujoco()  # raises errors now rather than while a program is traced
     engine = "native" if env.backend == "native" else "auto"
     known = {
         "expert": in_both_scenes(env),
@@ -199,7 +198,7 @@ def kitchen_demonstrators(env: Kitchen) -> dict[str, Demonstrator]:
 
 
 def in_one_scene(place: Kitchen) -> Demonstrator:
-    """The demonstrator in one world."""
+    """The demonstrator in one fixed world."""
 
     def task_in_turn(key: PRNGKeyArray, index: Int[Array, ""]) -> KitchenTask:
         del key
@@ -216,7 +215,7 @@ def in_one_scene(place: Kitchen) -> Demonstrator:
 
 
 def in_both_scenes(env: Kitchen) -> Demonstrator:
-    """The demonstrator in a scene that is drawn for each episode. It does not know what was drawn."""
+    """The demonstrator in a scene that is drawn for each episode. It does not observe the draw."""
     from envs.kitchen import varied
 
     place = varied.VariedKitchen(name=env.name, horizon=env.horizon)
@@ -242,28 +241,29 @@ def is_perfect(episode: Episode) -> Bool[Array, "*batch"]:
 
 
 def perfect_return(trajectory: Trajectory) -> Float[Array, ""]:
-    """1: whatever was completed in an episode is a task that the episode solves."""
+    """The return in hindsight: always 1, since the subtasks that were completed are a task that it
+    solves."""
     del trajectory
     return jnp.ones(())
 
 
-# The parts of one step: look, see whether the phase is over, advance the plan, act.
+# The parts of one step: observe, check whether the phase is over, advance the plan, act.
 
 
 def look(robot: Robot, positions: Float[Array, "30"]) -> Sight:
-    """What the demonstrator sees when the scene has these positions."""
+    """The demonstrator's observation of a scene with these joint positions."""
     return Sight(positions=positions, pose=arm_pose(robot.arm, positions[:NUM_JOINTS]))
 
 
 def current_phase(plan: Plan, memory: Memory) -> Phase:
-    """The row of the plan that the demonstrator is at."""
+    """The current row of the plan."""
     return jax.tree.map(
         lambda column: jnp.asarray(column)[memory.subtask, memory.phase], plan.phases
     )
 
 
 def next_subtask(state: KitchenState) -> Int[Array, ""]:
-    """The first subtask of the task that is not solved; the last one when all are."""
+    """The first unsolved subtask of the task; the last one if all are solved."""
     subtask = state.task.order[jnp.minimum(state.num_solved, NUM_SUBTASKS - 1)]
     return jnp.maximum(subtask, 0)
 
@@ -285,11 +285,11 @@ def is_over(scene: Scene, phase: Phase, memory: Memory, sight: Sight) -> Bool[Ar
 
 
 def advance(plan: Plan, memory: Memory, over: Bool[Array, ""], following: Int[Array, ""]) -> Memory:
-    """The next phase if the present one is over; after the last phase, the subtask ``following``.
+    """Go on to the next phase if the current one is over, or to the subtask ``following`` after the last.
 
-    That is the same subtask again where its phases did not complete it. A subtask's first try starts at
-    phase 1; its second, fourth and so on start at the phase in ``RETRY``, the others at phase 0, which
-    leads to ``HOME``.
+    That is the same subtask again if its phases did not complete it. The first try of a subtask starts at
+    phase 1. The second, fourth, .. try starts at the phase in ``RETRY``, the third, fifth, .. at phase 0,
+    which leads to ``HOME``.
     """
     phase = memory.phase + over
     last = phase >= jnp.asarray(plan.num_phases)[memory.subtask]
@@ -309,8 +309,8 @@ def act(robot: Robot, phase: Phase, subtask: Int[Array, ""], sight: Sight) -> Fl
     step = jnp.where(
         phase.joint_move, 0.5 * (phase.pose - sight.angles), step_toward(target, phase, sight)
     )
-    # Actuators act like springs: to make the step within the control period their targets must lie beyond
-    # it, and to hold the arm against gravity they must lie above it.
+    # Actuators act like springs. To complete the step within the control period, their targets must be
+    # beyond it, and to hold the arm against gravity they must be above it.
     wanted = (step / robot.reach + sight.pose.gravity / robot.stiffness) / MAX_SHIFT
     arm = wanted / jnp.maximum(1.0, jnp.max(jnp.abs(wanted)))
     fingers = jnp.clip(4 * (phase.grip - sight.fingers) / MAX_SHIFT, -1.0, 1.0)
@@ -324,7 +324,7 @@ def hand_target(
     joint: Float[Array, ""],
     lead: Float[Array, ""],
 ) -> Target:
-    """Where a phase wants the hand, with the joint of the subtask's object at ``joint``."""
+    """The target of the hand in a phase, given the position ``joint`` of the object's joint."""
     ahead = jnp.clip(joint + lead, phase.joint_range[0], phase.joint_range[1])
     slides = jnp.asarray(SLIDES)[subtask]
     turned = turn(jnp.where(slides, 0.0, ahead)) @ phase.point
@@ -339,9 +339,9 @@ def hand_target(
 
 
 def step_toward(target: Target, phase: Phase, sight: Sight) -> Float[Array, "7"]:
-    """Joint displacements of one step that brings the hand nearer to its target.
+    """The joint displacements of one step that brings the hand nearer to its target.
 
-    Where the pose of the hand leaves the joints free to move, they move towards ``REST``.
+    As far as the pose of the hand leaves the joints free, they move towards ``REST``.
     """
     pose, angles = sight.pose, sight.angles
     shift = _shorten(target.point - pose.tip, phase.speed)
@@ -353,7 +353,7 @@ def step_toward(target: Target, phase: Phase, sight: Sight) -> Float[Array, "7"]
     rest = 0.1 * (jnp.asarray(REST, jnp.float32) - angles)
     step = both[:, 0] + rest - both[:, 1:] @ rest
     blocked = ((angles + step > HIGH) & (step > 0)) | ((angles + step < LOW) & (step < 0))
-    # Joints that are at their limit stay there, and the others make up for them.
+    # Joints at their limits stay there, and the others compensate for them.
     free = damped_solve(jnp.where(blocked, 0.0, jacobian), error[:, None])[:, 0]
     held = jnp.where(blocked, jnp.clip(step, LOW - angles, HIGH - angles), free)
     return jnp.where(jnp.any(blocked), held, step)
@@ -364,7 +364,7 @@ def damped_solve(
 ) -> Float[Array, "7 N"]:
     """Joint displacements for each column of hand displacements, by damped least squares.
 
-    The damping keeps them small where the arm is stretched out and no displacement would do.
+    The damping keeps them small near singularities, where the arm is stretched out.
     """
     return jacobian.T @ jnp.linalg.solve(jacobian @ jacobian.T + DAMPING**2 * jnp.eye(6), columns)
 

@@ -1,6 +1,6 @@
-"""Which physics engine steps the kitchen: ``native`` (C MuJoCo) or ``mjx`` (MuJoCo in JAX).
+"""The choice of the kitchen's physics engine: ``native`` (C MuJoCo) or ``mjx`` (MuJoCo in JAX).
 
-Both are imported when they are first used.
+Engines are imported when they are first used.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ BACKENDS = ("auto", "native", "mjx")
 
 
 def resolve_backend(backend: str, model: str) -> str:
-    """The engine behind ``auto``: MJX on accelerators, C on CPUs and for the stock model."""
+    """Resolve ``auto`` to an engine: MJX on accelerators, C MuJoCo on CPUs and for the stock model."""
     if backend != "auto":
         return backend
     return "native" if model == "stock" or jax.default_backend() == "cpu" else "mjx"
@@ -27,10 +27,10 @@ def load_physics(backend: str, model: str) -> Physics:
     """The engine ``native`` or ``mjx`` with the model ``reduced`` or ``stock``.
 
     Raises:
-      MissingExtraError: if the packages of the kitchen are missing or do not fit together.
-      NoOpenGLError: if the OpenGL that ``MUJOCO_GL`` names is missing.
+      MissingExtraError: if the packages of the kitchen are missing or incompatible with each other.
+      NoOpenGLError: if the OpenGL backend that ``MUJOCO_GL`` names is missing.
     """
-    import_mujoco()  # complains before its first use
+    import_mujoco()  # raises errors before its first use
     if backend == "native":
         from envs.kitchen.native import native_physics
 

@@ -1,15 +1,15 @@
-"""The kitchen: complete subtasks in an order that the task goal does not tell.
+"""The kitchen: complete subtasks in an order that the task goal does not reveal.
 
-Paper, section 4.1 and appendix C.2. The scene, its 59 numbers of observation, the 9 velocity actions
-and what counts as a completed subtask are those of gymnasium-robotics' FrankaKitchen without observation
-noise, as in the authors' code; so is the rule of the reward: 1/n when the next subtask of the task is
-complete and no later one is. Whatever was completed once stays completed, also when its joint moves back,
-so that a subtask which is completed too early ends all reward. The task goal names the set of subtasks; a
+Source: paper, section 4.1 and appendix C.2. The scene, the 59-dimensional observation, the 9 velocity
+actions and the criterion for a completed subtask are those of gymnasium-robotics' FrankaKitchen without
+observation noise, as in the authors' code. So is the reward rule: 1/n when the next subtask of the task is
+complete and no later one is. A subtask that was completed once stays completed even if its joint moves
+back, so completing a subtask too early prevents all further reward. The task goal is the set of subtasks; a
 goal is the one subtask that was just completed.
 
-Observation: 9 positions and 9 velocities of arm and fingers, 21 positions and 20 velocities of the
-objects (rad, m, rad/s, m/s). An action in [-1, 1] moves the targets of the joint actuators to at most
-0.16 rad or m from where the joints are.
+Observation: 9 positions and 9 velocities of arm and fingers, 21 positions and 20 velocities of the objects
+(rad, m, rad/s, m/s). An action in [-1, 1] sets the targets of the joint actuators to at most 0.16 rad or m
+from the current joint positions.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from envs.kitchen.physics import MODELS, NUM_ROBOT, Physics
 
 SUBTASKS = ("bottom burner", "light switch", "slide cabinet", "hinge cabinet", "microwave")
 NUM_SUBTASKS = len(SUBTASKS)
-NONE = -1  # fills an order of fewer than 5 subtasks
+NONE = -1  # padding of orders with fewer than 5 subtasks
 
-# Positions of the full scene that a subtask is about, and where they should be (gymnasium-robotics,
-# OBS_ELEMENT_INDICES and OBS_ELEMENT_GOALS).
+# The joint positions of the full scene that define each subtask, by index, and their targets
+# (gymnasium-robotics, OBS_ELEMENT_INDICES and OBS_ELEMENT_GOALS).
 TARGETS = (
     {11: -0.88, 12: -0.01},
     {17: -0.69, 18: -0.05},
@@ -43,23 +43,23 @@ TARGETS = (
 )
 THRESHOLD = 0.3
 NUM_POSITIONS, OBS_DIM = 30, 59
-# Where they are in an observation: positions and velocities of the robot, then of the objects.
+# Their indices in an observation: positions and velocities of the robot, then of the objects.
 POSITIONS, VELOCITIES = np.r_[:9, 18:39], np.r_[9:18, 39:59]
 
-# Up to jax 0.10 the fusion emitters of XLA's CPU backend make MJX's batched graph hundreds of times slower.
-# Since 0.11 they cannot be switched off, and the graph is half as fast as without them.
+# Up to jax 0.10 the fusion emitters of XLA's CPU backend slow MJX's batched graph down by a factor of
+# hundreds. Since 0.11 they cannot be switched off, and the graph is half as fast as without them.
 MJX_ON_CPU = (("xla_cpu_use_fusion_emitters", False),) if jax.__version_info__ < (0, 11) else ()
-# Smallest efficient batch: below it the overhead of a call into C MuJoCo dominates, and MJX, which computes
-# in vectors, does not fill them.
+# Smallest efficient batch. Below it the overhead of a call into C MuJoCo dominates, and MJX does not fill
+# the vector units.
 WORLDS_TOGETHER = 8
-MAX_SPEED = 1e3  # of any joint; physics beyond has diverged
+MAX_SPEED = 1e3  # largest speed of a joint; beyond it the physics has diverged
 
 
 class KitchenTask(NamedTuple):
     """Which subtasks to complete, and in which order."""
 
     order: Int[Array, "*batch S"]
-    """Indices into ``SUBTASKS``, then ``NONE`` up to 5 places."""
+    """Indices into ``SUBTASKS``, padded with ``NONE`` to 5 places."""
 
 
 class KitchenState(NamedTuple):
@@ -68,16 +68,17 @@ class KitchenState(NamedTuple):
     task: Task
     """A ``KitchenTask``, or another task with an ``order``."""
     physics: State
-    """That of the engine, with positions ``qpos`` and velocities ``qvel``."""
+    """The state of the engine, with positions ``qpos`` and velocities ``qvel``."""
     completed: Bool[Array, "S"]
-    """Subtasks that have been completed at least once."""
+    """Which subtasks have been completed at least once."""
     newly: Bool[Array, "S"]
-    """The subtask that the last step completed for the first time, if it did."""
+    """Which subtask, if any, the last step completed for the first time."""
     num_solved: Int[Array, ""]
-    """Subtasks completed in order."""
+    """Number of subtasks completed in order."""
     steps: Int[Array, ""]
     failed: Bool[Array, ""]
-    """Whether physics diverged or an action was not finite; ``physics`` is from before that step."""
+    """Whether the physics diverged or an action was not finite; ``physics`` is then the state before that
+    step."""
     done: Bool[Array, ""]
 
 
@@ -86,10 +87,10 @@ class Kitchen(Environment):
     """The kitchen world.
 
     Attributes:
-      name: what messages and file names call it.
-      horizon: steps after which an episode is truncated (paper: 500).
-      backend: ``native`` (C MuJoCo on threads), ``mjx`` (JAX), or ``auto``: MJX on accelerators.
-      model: ``reduced``, or ``stock`` for the scene of gymnasium-robotics as it is (native only).
+      name: its name in messages and file names.
+      horizon: number of steps after which an episode is truncated (paper: 500).
+      backend: ``native`` (C MuJoCo on threads), ``mjx`` (JAX), or ``auto`` (MJX on accelerators).
+      model: ``reduced``, or ``stock`` for the unmodified scene of gymnasium-robotics (native only).
     """
 
     name: str
@@ -142,7 +143,7 @@ class Kitchen(Environment):
         return self.task(jax.random.randint(key, (), 0, self.num_tasks))
 
     def task(self, index: Int[Array, ""]) -> KitchenTask:
-        """The tasks in a fixed order, over and over again: shorter ones first."""
+        """The task with an index in a fixed enumeration, shorter ones first, which repeats endlessly."""
         return KitchenTask(order=jnp.asarray(_all_orders())[index % self.num_tasks])
 
     def sample_goal(self, key: PRNGKeyArray) -> Float[Array, "G"]:
@@ -150,7 +151,7 @@ class Kitchen(Environment):
 
     @property
     def goal_set(self) -> np.ndarray:
-        """The subtasks."""
+        """One goal for each subtask."""
         return np.eye(NUM_SUBTASKS, dtype=np.float32)
 
     def expert_goal(self, state: KitchenState, num_steps: int) -> Float[Array, "G"]:
@@ -169,7 +170,7 @@ class Kitchen(Environment):
         return jnp.ones(())
 
     def num_parts(self, task: Task) -> Int[Array, ""]:
-        """The subtasks of the task."""
+        """The number of subtasks in the task."""
         return jnp.sum(task.order != NONE)
 
     def fingerprint(self, task: Task) -> Int[Array, "F"]:
@@ -198,7 +199,7 @@ class Kitchen(Environment):
                 raise ValueError(f"task {index}: a subtask occurs twice in {subtasks.tolist()}")
 
     def reset(self, key: PRNGKeyArray, task: Task) -> tuple[KitchenState, TimeStep]:
-        """The arm in front of the closed kitchen, always at the same place."""
+        """Begin with the arm in front of the closed kitchen, always in the same state."""
         del key
         none, zero = jnp.zeros(NUM_SUBTASKS, bool), jnp.zeros((), jnp.int32)
         no = jnp.zeros((), bool)
@@ -215,7 +216,7 @@ class Kitchen(Environment):
         return state, self._observe(state, reward=jnp.zeros(()), complete=no)
 
     def initial_physics(self, task: Task) -> State:
-        """Where an episode starts, the same for all tasks."""
+        """The initial physics state of an episode, the same for all tasks."""
         del task
         return jax.tree.map(jnp.asarray, self.physics.initial)
 
@@ -229,14 +230,14 @@ class Kitchen(Environment):
         order, num_solved = state.task.order, state.num_solved
         num_subtasks = jnp.sum(order != NONE)
         place = jnp.arange(NUM_SUBTASKS)
-        # At most one subtask is completed in a step, so that every goal names a single one. Of two that
-        # arrive together, the next one of the task counts now and the other one step later.
+        # At most one subtask is completed in a step, so that every goal is a single subtask. If two arrive
+        # together, the next one of the task counts now and the other one a step later.
         arrived = self._at_target(physics) & ~state.completed & ~failed
         expected = place == order[jnp.minimum(num_solved, NUM_SUBTASKS - 1)]
         newly = arrived & (place == jnp.argmax(arrived * (1 + expected)))
         completed = state.completed | newly
-        # The reward is due when the solved subtasks and the next one are complete and, of the task's
-        # subtasks, no later one is.
+        # The reward is paid when the solved subtasks and the next one are complete, and none of the task's
+        # later subtasks is.
         in_order = jnp.all((completed[order] == (place <= num_solved)) | (place >= num_subtasks))
         num_solved += in_order
         steps = state.steps + 1
@@ -282,14 +283,14 @@ class Kitchen(Environment):
 
 
 def _is_sane(physics: State) -> Bool[Array, ""]:
-    """Whether a step of physics gave finite numbers of a credible size."""
+    """Whether a physics step gave finite numbers of a plausible size."""
     finite = [jnp.all(jnp.isfinite(leaf)) for leaf in physics]
     return jnp.all(jnp.stack(finite)) & jnp.all(jnp.abs(physics.qvel) < MAX_SPEED)
 
 
 @cache
 def _target_table() -> tuple[np.ndarray, np.ndarray]:
-    """Which of the 30 positions count for each subtask, and their targets, ``[5, 30]`` each."""
+    """Which of the 30 positions define each subtask, and their targets, ``[5, 30]`` each."""
     counts = np.zeros((NUM_SUBTASKS, NUM_POSITIONS), bool)
     targets = np.zeros((NUM_SUBTASKS, NUM_POSITIONS), np.float32)
     for subtask, joints in enumerate(TARGETS):

@@ -1,7 +1,7 @@
-"""The packages behind the kitchen: found, complete and of matching versions, or a clear error.
+"""A check that the packages of the kitchen are installed, complete and of matching versions.
 
-The scene belongs to gymnasium-robotics, which ships it as files; nothing of it is copied here, and its
-Python code is imported by ``official.py`` alone, to compare with it.
+The scene is part of gymnasium-robotics, which ships it as files. Nothing of it is copied here, and its
+Python code is imported only by ``official.py``, for comparisons.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SCENE = Path("envs/assets/kitchen_franka/kitchen_assets/kitchen_env_model.xml")
 
 
 class NoOpenGLError(ImportError):
-    """There is no OpenGL of the kind that ``MUJOCO_GL`` names."""
+    """The OpenGL backend that ``MUJOCO_GL`` names is not available."""
 
     def __init__(self, cause: Exception) -> None:
         name = os.environ.get("MUJOCO_GL")
@@ -33,7 +33,8 @@ class NoOpenGLError(ImportError):
 
 @cache
 def check_extra() -> None:
-    """Raise ``MissingExtraError`` unless physics and scene can be loaded; imports neither."""
+    """Raise ``MissingExtraError`` unless the engine and the scene can be loaded, without importing
+    either."""
     mujoco, mjx = (_installed_version(name) for name in ("mujoco", "mujoco-mjx"))
     if mujoco != mjx:
         raise MissingExtraError(
@@ -48,11 +49,11 @@ def check_extra() -> None:
 
 
 def import_mujoco() -> ModuleType:
-    """The module ``mujoco``, which looks for the OpenGL that ``MUJOCO_GL`` names when it is imported.
+    """Import the module ``mujoco``, which on import loads the OpenGL backend that ``MUJOCO_GL`` names.
 
     Raises:
       MissingExtraError: if the packages of the kitchen are missing.
-      NoOpenGLError: if that OpenGL is.
+      NoOpenGLError: if that OpenGL backend is missing.
     """
     check_extra()
     try:
@@ -65,7 +66,7 @@ def import_mujoco() -> ModuleType:
 
 
 def scene_path() -> Path:
-    """The scene's main file in the installed gymnasium-robotics."""
+    """The main file of the scene in the installed gymnasium-robotics."""
     _installed_version("gymnasium-robotics")
     for folder in _folders("gymnasium_robotics"):
         if (path := folder / SCENE).is_file():
@@ -83,6 +84,6 @@ def _installed_version(package: str) -> str:
 
 
 def _folders(module: str) -> list[Path]:
-    """Where an installed module is, without importing it."""
+    """The folders of an installed module, without importing it."""
     spec = importlib.util.find_spec(module)
     return [Path(folder) for folder in (spec.submodule_search_locations or ())] if spec else []

@@ -1,8 +1,9 @@
-"""How true and how fast the kitchen's physics is: ``python -m envs.kitchen.fidelity``.
+"""Measures the accuracy and speed of the kitchen's physics: ``python -m envs.kitchen.fidelity``.
 
-Over random actions: our world on the stock model with gymnasium-robotics' FrankaKitchen, the reduced model
-with the stock model, and MJX with C MuJoCo. Over demonstrations: what the demonstrator completes on either
-model, and whether the actions of those on the stock model lead to the same in FrankaKitchen.
+Under random actions it compares our world on the stock model with gymnasium-robotics' FrankaKitchen, the
+reduced model with the stock model, and MJX with C MuJoCo. For demonstrations it reports what the
+demonstrator completes on each model, and whether the actions of those on the stock model have the same
+results in FrankaKitchen.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from envs.kitchen.official import franka_kitchen
 from envs.kitchen.physics import PhysicsState, position_targets
 
 ARM, OBJECTS = slice(0, 7), slice(18, 32)
-NUM_LONGEST = 120  # tasks of all five subtasks, the last in the enumeration
+NUM_LONGEST = 120  # number of tasks with all five subtasks, which come last in the enumeration
 # Iterations of MJX's contact solver and of its line search.
 SOLVERS = ((1, 4), (2, 4), (4, 6), (8, 10), (16, 16))
 GYMNASIUM, BATCH, STOCK, REDUCED, MJX = (
@@ -44,13 +45,13 @@ class FidelityConfig:
     """Settings of this command."""
 
     worlds: int = 32
-    """Episodes of random actions."""
+    """Number of episodes with random actions."""
     steps: int = 40
-    """Control steps of each."""
+    """Number of control steps in each of them."""
     mjx: bool = True
-    """Compare MJX too (compiles for half a minute on a CPU)."""
+    """Compare MJX, too (compiles for half a minute on a CPU)."""
     demonstrations: int = 8
-    """Demonstrations of all five subtasks on each model."""
+    """Number of demonstrations of all five subtasks on each model."""
     solvers: bool = False
     """Compare settings of MJX's contact solver, too (compiles for some minutes)."""
 
@@ -66,15 +67,15 @@ def jit_for(env: Kitchen) -> Callable[[Callable], Any]:
 
 
 class Recording(NamedTuple):
-    """What episodes with given actions look like, and what they cost."""
+    """The observations of episodes with given actions, and the speed of running them."""
 
     obs: Float[np.ndarray, "B T 59"]
     rate: float
-    """Control steps per CPU-second, compilation aside."""
+    """Control steps per CPU-second, without compilation."""
 
 
 def record(env: Kitchen, actions: Float[np.ndarray, "B T 9"]) -> Recording:
-    """Our world."""
+    """Record our world."""
     state, _ = env.reset(jax.random.key(0), env.task(jnp.array(env.num_tasks - 1)))
 
     def play(rows: jax.Array) -> jax.Array:
@@ -88,7 +89,7 @@ def record(env: Kitchen, actions: Float[np.ndarray, "B T 9"]) -> Recording:
 
 
 def record_gymnasium(actions: Float[np.ndarray, "B T 9"]) -> Recording:
-    """FrankaKitchen."""
+    """Record FrankaKitchen."""
     theirs = franka_kitchen(actions.shape[1])
 
     def play(rows: np.ndarray) -> list[np.ndarray]:
@@ -101,7 +102,7 @@ def record_gymnasium(actions: Float[np.ndarray, "B T 9"]) -> Recording:
 
 
 def record_batch(actions: Float[np.ndarray, "B T 9"]) -> Recording:
-    """MuJoCo's own batch stepper on the full scene, without any world around it."""
+    """Record MuJoCo's own batch stepper on the full scene, without a world around it."""
     from mujoco.batch import Batch
 
     from envs.kitchen.model import INITIAL_POSITIONS, SUBSTEPS, full_model
@@ -120,14 +121,14 @@ def record_batch(actions: Float[np.ndarray, "B T 9"]) -> Recording:
 
 
 def random_actions(num_worlds: int, num_steps: int) -> Float[np.ndarray, "B T 9"]:
-    """Uniform in the cube, held for five steps each: the arm gets around."""
+    """Actions drawn uniformly from the cube and held for five steps each, so that the arm moves around."""
     rng = np.random.default_rng(0)
     targets = rng.uniform(-1, 1, (num_worlds, -(-num_steps // 5), 9)).astype(np.float32)
     return np.repeat(targets, 5, axis=1)[:, :num_steps]
 
 
 def recordings(config: FidelityConfig) -> dict[str, Recording]:
-    """All models and engines under the same actions."""
+    """Record all models and engines under the same actions."""
     actions = random_actions(config.worlds, config.steps)
     found = {
         GYMNASIUM: record_gymnasium(actions),
@@ -162,10 +163,10 @@ def completions(episodes: Episode) -> list[np.ndarray]:
 
 
 def replay_in_gymnasium(episodes: Episode) -> Iterator[tuple[list[str], list[str], float]]:
-    """The recorded actions in FrankaKitchen.
+    """Replay recorded actions in FrankaKitchen.
 
-    Yields, for each episode, what it completed here and there, in order, and the largest difference of any
-    number of an observation, rounded to float32.
+    Yields for each episode the subtasks completed here and there, in order, and the largest difference
+    between components of observations, rounded to float32.
     """
     trajectory = episodes.trajectory
     franka = franka_kitchen(trajectory.actions.shape[1])
@@ -183,21 +184,21 @@ def replay_in_gymnasium(episodes: Episode) -> Iterator[tuple[list[str], list[str
 
 
 class Pair(NamedTuple):
-    """A state of physics and the action of the next control step."""
+    """A physics state and the action of the next control step."""
 
     physics: PhysicsState
     action: Float[Array, "9"]
 
 
 def demonstrated_states(env: Kitchen, episodes: Episode) -> Pair:
-    """All states of demonstrations but the first and last, ``[N, ..]``."""
+    """All states of demonstrations except for the first and the last one, ``[N, ..]``."""
     from envs.kitchen.model import joint_addresses
 
     positions, velocities = joint_addresses(env.model)
     start, _ = env.reset(jax.random.key(0), env.task(jnp.zeros((), jnp.int32)))
 
     def second(obs: Array, first: Array, then: Array) -> Pair:
-        """From the first state that is observed to the second, which has a warm start as well."""
+        """Step from an observed state to the next one, which then has a warm start, too."""
         physics = PhysicsState(
             qpos=obs[POSITIONS][positions],
             qvel=obs[VELOCITIES][velocities],
@@ -213,14 +214,14 @@ def demonstrated_states(env: Kitchen, episodes: Episode) -> Pair:
 
 
 def compare_solvers(episodes: Episode, together: int) -> Iterator[str]:
-    """One control step of MJX from every state of demonstrations, against C MuJoCo."""
+    """Compare one control step of MJX from every state of demonstrations with C MuJoCo."""
     from envs.kitchen.mjx import mjx_physics
     from envs.kitchen.model import SUBSTEPS
 
     env = kitchen("native")
     pairs = demonstrated_states(env, episodes)
     together = min(together, len(pairs.action))
-    whole = len(pairs.action) // together * together  # a remainder would be another program
+    whole = len(pairs.action) // together * together  # a remainder would be compiled separately
     pairs = jax.tree.map(lambda leaf: leaf[:whole].reshape(-1, together, *leaf.shape[1:]), pairs)
     on = jnp.ones((), bool)
     exact = jax.lax.map(
@@ -242,7 +243,7 @@ def compare_solvers(episodes: Episode, together: int) -> Iterator[str]:
 
 
 def report_random_actions(config: FidelityConfig) -> None:
-    """Print how fast all models and engines are, and how far they part under random actions."""
+    """Print the speed of all models and engines, and how far they diverge under random actions."""
     found = recordings(config)
     print(f"{config.worlds} episodes of {config.steps} steps, uniform actions held for 5 steps")
     for name, recording in found.items():
@@ -277,7 +278,7 @@ def report_demonstrations(demonstrations: dict[str, Episode]) -> None:
 
 
 def report_solvers(episodes: Episode, together: int) -> None:
-    """Print how far single steps of MJX are from those of C, by the settings of its solver."""
+    """Print how far single steps of MJX are from those of C MuJoCo, for several settings of its solver."""
     head = "".join(f"{name:>10}" for name in ("median", "99 %", "99.9 %", "largest"))
     print(
         "\nMJX against C after one control step: largest difference of a position; substeps / CPU-s"
@@ -289,7 +290,7 @@ def report_solvers(episodes: Episode, together: int) -> None:
 
 
 def report_gymnasium(episodes: Episode) -> None:
-    """Print whether the actions of demonstrations lead to the same in FrankaKitchen."""
+    """Print whether the actions of demonstrations have the same results in FrankaKitchen."""
     outcomes = list(replay_in_gymnasium(episodes))
     same = sum(ours == theirs for ours, theirs, _ in outcomes)
     error = max(error for _, _, error in outcomes)
@@ -304,7 +305,7 @@ def main(config: FidelityConfig) -> None:
     for name in ("worlds", "steps", "demonstrations"):
         if getattr(config, name) < 1:
             raise UsageError(f"--{name} must be at least 1, found {getattr(config, name)}")
-    import_mujoco()  # complains now and not in the middle of a program
+    import_mujoco()  # raises errors now rather than while a program is traced
     report_random_actions(config)
     worlds = {STOCK: kitchen("native", "stock"), REDUCED: kitchen("native")}
     if config.mjx:

@@ -3,13 +3,16 @@
 The reduced model keeps the kinematics, masses and inertias, joints and actuators of the arm and of the five
 objects that the subtasks move. It differs from the stock scene in that
 
-- everything else stands still: three knobs, the left hinge door and the kettle (which nothing touches);
-- the burner and the lamp, which equality constraints tie to their switches, are computed from them;
-- collisions are those of fingers and hand with the handles, the knob, the light switch, three doors and the
-  counter, all of them capsules; the rest of the arm passes through the furniture;
-- it takes 10 steps of 0.008 s in a control step, the stock scene 40 of 0.002 s; so that grasps hold at that
-  step, sliding friction is 2 instead of 1 and contacts have a higher impedance (``solimp``), but a slower
-  reference (``solref``); fingers have no friction against rolling and spinning (``condim`` 3, there 6).
+- everything else is fixed: three knobs, the left hinge door and the kettle (which nothing touches);
+- the burner and the lamp, which equality constraints tie to their switches, are computed from the switches;
+- only the fingers and the hand collide, with the handles, the knob, the light switch, three doors and the
+counter, all
+  of which are capsules; the rest of the arm passes through the furniture;
+- a control step consists of 10 steps of 0.008 s, in the stock scene of 40 steps of 0.002 s. For grasps to
+hold at that
+  step size, sliding friction is 2 instead of 1, and contacts have a higher impedance (``solimp``) but a
+  slower reference (``solref``). Fingers have no friction against rolling and spinning (``condim`` 3 instead
+  of 6).
 
 The scene (kitchen: Copyright 2019 The DSuite Authors; Franka arm: modified from
 github.com/vikashplus/franka; both Apache License 2.0) is read from the installed gymnasium-robotics.
@@ -53,7 +56,7 @@ INITIAL_POSITIONS = np.array([
     -2.69397440e-01, 3.50383255e-01, 1.61944683e00,
     1.00618764e00, 4.06395120e-03, -6.62095997e-03, -2.68278933e-04,
 ])  # fmt: skip
-KETTLE_AT_REST = (-0.2694, 0.3504, 1.6203, 1.0, 0.0, 0.0, 0.0)  # where the stock scene settles
+KETTLE_AT_REST = (-0.2694, 0.3504, 1.6203, 1.0, 0.0, 0.0, 0.0)  # in the settled stock scene
 
 
 class Capsule(NamedTuple):
@@ -66,7 +69,7 @@ class Capsule(NamedTuple):
     radius: float
 
 
-# Placed by hand along the shapes that collide in the stock scene.
+# Placed by hand along the collision shapes of the stock scene.
 FINGERS = (
     Capsule("left finger", "panda0_leftfinger", (0, 0.0112, 0.034), (0, 0.0112, 0.084), 0.0105),
     Capsule("right finger", "panda0_rightfinger", (0, -0.0112, 0.034), (0, -0.0112, 0.084), 0.0105),
@@ -89,7 +92,8 @@ HANDLES = (
     ),
 )
 COUNTER_HEIGHT = 1.6  # m
-# MJX solves as many contacts as there may be, here the nearest so many; demonstrations have up to 2.
+# MJX always solves for the largest number of contacts, here limited to the nearest ones; demonstrations
+# have up to 2.
 MAX_CONTACTS = 8
 SITES = (
     "end_effector",
@@ -103,10 +107,10 @@ SITES = (
 
 @cache
 def load_model(name: str) -> mujoco.MjModel:
-    """The model ``reduced`` or ``stock``; a world that diverges is left as it is, not reset.
+    """The model ``reduced`` or ``stock``, in which diverged worlds are not reset automatically.
 
-    The stock model is the full one without the shapes that only are to be seen. It moves in the same way,
-    to the last bit, and a tenth faster.
+    The stock model is the full one without its purely visual shapes. It gives the same results bit for bit,
+    and is a tenth faster.
     """
     model = _stock_model() if name == "stock" else reduce_model(full_model())
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
@@ -114,19 +118,20 @@ def load_model(name: str) -> mujoco.MjModel:
 
 
 def initial_positions(name: str) -> Float[np.ndarray, "Q"]:
-    """Where every episode starts."""
+    """The joint positions at the start of every episode."""
     return INITIAL_POSITIONS[joint_addresses(name)[0]]
 
 
 def initial_state(name: str) -> PhysicsState:
-    """Where every episode starts, at rest."""
+    """The state at the start of every episode, at rest."""
     positions: Any = initial_positions(name).astype(np.float32)
     rest: Any = np.zeros(load_model(name).nv, np.float32)
     return PhysicsState(qpos=positions, qvel=rest, warmstart=rest)
 
 
 def scene_coordinates(name: str) -> tuple[Coordinates, Coordinates]:
-    """How the 30 positions and 29 velocities of the full scene follow from those of a model."""
+    """The mappings from a model's positions and velocities to the 30 positions and 29 velocities of the
+    full scene."""
     positions, velocities = joint_addresses(name)
     full = full_model()
     still = np.concatenate([INITIAL_POSITIONS[:-7], KETTLE_AT_REST])
@@ -137,7 +142,7 @@ def scene_coordinates(name: str) -> tuple[Coordinates, Coordinates]:
 
 
 def joint_addresses(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Where a model's positions and velocities are in those of the full scene."""
+    """The indices of a model's positions and velocities in those of the full scene."""
     model, full = load_model(name), full_model()
     if name == "stock":
         return np.arange(full.nq), np.arange(full.nv)
@@ -149,7 +154,7 @@ def joint_addresses(name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def reduce_model(full: mujoco.MjModel) -> mujoco.MjModel:
-    """The reduced model, made from the compiled stock scene."""
+    """Build the reduced model from the compiled stock scene."""
     data = mujoco.MjData(full)
     mujoco.mj_kinematics(full, data)
     spec = mujoco.MjSpec()
@@ -190,7 +195,7 @@ def reduce_model(full: mujoco.MjModel) -> mujoco.MjModel:
             geomname1=first,
             geomname2=second,
             condim=3,
-            friction=[2, 2, 0, 0, 0],  # against sliding; condim 3 reads no other
+            friction=[2, 2, 0, 0, 0],  # sliding friction; condim 3 uses no other
             solref=[0.02, 1],
             solimp=[0.95, 0.99, 0.001, 0.5, 2],
             margin=0.001,
@@ -203,7 +208,8 @@ def reduce_model(full: mujoco.MjModel) -> mujoco.MjModel:
 
 @cache
 def full_model() -> mujoco.MjModel:
-    """The scene of gymnasium-robotics with everything that can be seen: for pictures, and to reduce."""
+    """The full scene of gymnasium-robotics with all visual shapes, for pictures and as the source of the
+    others."""
     check_extra()
     return mujoco.MjModel.from_xml_path(str(scene_path()))
 
@@ -221,7 +227,8 @@ def _copy_body(
     index: int,
     bodies: dict[int, mujoco.MjsBody],
 ) -> mujoco.MjsBody:
-    """A body with its joint, inertia as compiled; the fixed bodies above it become one pose."""
+    """Copy a body with its joint and compiled inertia; the fixed bodies above it are merged into one
+    pose."""
     body = full.body(index)
     parent = int(body.parentid[0])
     pose = {"pos": body.pos, "quat": body.quat}
@@ -271,7 +278,8 @@ def _copy_actuator(full: mujoco.MjModel, index: int, spec: mujoco.MjSpec) -> Non
 def _coordinates(
     addresses: np.ndarray, still: np.ndarray, full: mujoco.MjModel, joint_address: np.ndarray
 ) -> Coordinates:
-    """Coordinates of the scene from those at ``addresses``; the others keep the values ``still``."""
+    """The mapping to the scene's coordinates from those at ``addresses``; others keep the values
+    ``still``."""
     source = np.zeros(len(still), np.int32)
     scale = np.zeros(len(still), np.float32)
     base = still.astype(np.float32)

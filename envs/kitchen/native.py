@@ -1,4 +1,4 @@
-"""C MuJoCo behind a callback: a batch of worlds on a pool of threads, inside jitted programs."""
+"""C MuJoCo within jitted programs: a callback steps a batch of worlds on a pool of threads."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ from envs.kitchen.model import (
 )
 from envs.kitchen.physics import ExactState, Physics, PhysicsState, position_targets
 
-WORLDS_PER_THREAD = 8  # with fewer, waking the thread takes longer than the work it does
+WORLDS_PER_THREAD = 8  # with fewer, waking the thread takes longer than its work
 
 
 def num_threads(num_worlds: int) -> int:
-    """How many threads step so many worlds fastest here."""
+    """The number of threads that step ``num_worlds`` worlds fastest on this machine."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return min(cores or 1, -(-num_worlds // WORLDS_PER_THREAD))
 
 
 class Stepper:
-    """Steps any number of worlds of one model; callers may be on several threads.
+    """Steps any number of worlds of one model. It is thread-safe.
 
     Args:
       model: the model.
-      num_substeps: steps of MuJoCo in a control step.
-      fields: names of fields of the model that each world has its own values of.
+      num_substeps: number of MuJoCo steps in a control step.
+      fields: names of the model's fields whose values differ between worlds.
     """
 
     def __init__(
@@ -54,14 +54,14 @@ class Stepper:
         self._lock = Lock()
 
     def __call__(self, rows: Array | np.ndarray) -> np.ndarray:
-        """New states ``[..., Q + 2 V]`` of rows ``[..., Q + 2 V + U + 1]``.
+        """The new states ``[..., Q + 2 V]`` after a control step of rows ``[..., Q + 2 V + U + 1]``.
 
-        A row holds positions, velocities, warm start, controls and whether to step at all. Worlds
-        that MuJoCo gives up on come back as NaN.
+        A row holds positions, velocities, warm start, controls and whether to step at all. The state of a
+        world that MuJoCo fails to step is NaN.
         """
         width = sum(self.sizes)
-        # Converted to numpy first: a jax operation inside of a callback may wait for the very program that
-        # waits for the callback.
+        # Converted to numpy first, since a jax operation in a callback may wait for the program that is
+        # waiting for the callback.
         flat = np.asarray(rows).reshape(-1, rows.shape[-1])
         after = self.step(flat[:, :width], flat[:, width:-1], flat[:, -1] > 0)
         return after.astype(np.float32).reshape(*rows.shape[:-1], width)
@@ -73,13 +73,13 @@ class Stepper:
         active: Bool[np.ndarray, "B"],
         values: Mapping[str, np.ndarray] | None = None,
     ) -> Float[np.ndarray, "B N"]:
-        """The states of B worlds after a control step, float64; those not active stay as they are.
+        """The states of B worlds after a control step, in float64; inactive worlds are unchanged.
 
         Args:
           before: positions, velocities and warm starts.
           ctrl: position targets of the actuators.
           active: which worlds to step.
-          values: of the fields that each world has its own of, ``[B, ...]`` each.
+          values: the values of the fields that differ between worlds, ``[B, ...]`` each.
         """
         batch = self._take(len(before))
         names = ("qpos", "qvel", "qacc_warmstart")
@@ -113,17 +113,17 @@ class Stepper:
 
 
 class ExactStepper:
-    """Steps worlds whose states are in double precision, as MuJoCo and FrankaKitchen have them."""
+    """Steps worlds whose states are in double precision, as in MuJoCo and FrankaKitchen."""
 
     def __init__(self, stepper: Stepper) -> None:
         self.stepper = stepper
         self.sizes = (2 * sum(stepper.sizes), stepper.sizes[0], stepper.sizes[1])
 
     def __call__(self, rows: Array | np.ndarray) -> np.ndarray:
-        """New states ``[..., 2 N + Q + V]`` of rows ``[..., 2 N + 9 + 1]``, all as integers of 32 bits.
+        """The new states ``[..., 2 N + Q + V]`` of rows ``[..., 2 N + 9 + 1]``, all as 32-bit integers.
 
-        A row holds the N = Q + 2 V numbers of a state in float64, the action in float32 and whether to
-        step at all. A new state also has its positions and velocities in float32.
+        A row holds the N = Q + 2 V numbers of a state in float64, the action in float32 and whether to step
+        at all. A new state also holds its positions and velocities in float32.
         """
         flat, num = np.asarray(rows).reshape(-1, rows.shape[-1]), self.sizes[0]
         before = np.ascontiguousarray(flat[:, :num]).view(np.float64)
@@ -135,7 +135,8 @@ class ExactStepper:
 
 
 def silence_warnings() -> None:
-    """Let diverged worlds be flagged in their states alone; MuJoCo would also write a log to the folder."""
+    """Silence MuJoCo's warnings about diverged worlds, which it also logs to a file; their states show
+    it."""
     if mujoco.get_mju_user_warning() is None:
         mujoco.set_mju_user_warning(lambda message: None)
 
@@ -143,16 +144,16 @@ def silence_warnings() -> None:
 def in_programs(
     stepper: Callable[[Array | np.ndarray], np.ndarray], width: int, dtype: Any = jnp.float32
 ) -> Callable[[Shaped[Array, "N"]], Shaped[Array, "M"]]:
-    """A function of numpy arrays ``[..., N] -> [..., M]`` for one row, to be used in jitted programs.
+    """Turn a function of numpy arrays ``[..., N] -> [..., M]`` into a jax function of one row.
 
     Args:
       stepper: the function.
       width: M.
-      dtype: of what it returns.
+      dtype: dtype of its result.
     """
 
-    # For CPU devices: a pure_callback copies large arguments on the threads of the device. These may all be
-    # waiting for the callback, which then never begins. A buffer_callback copies nothing.
+    # For CPU devices: a pure_callback copies large arguments on the threads of the device. If all of these
+    # wait for the callback, it never begins. A buffer_callback copies nothing.
     def write(context: Any, out: Any, rows: Any) -> None:
         del context
         np.asarray(out)[...] = stepper(np.asarray(rows))
@@ -167,7 +168,7 @@ def in_programs(
 
 
 def native_physics(name: str) -> Physics:
-    """The C engine with the model ``reduced``, or with ``stock``, whose states are exact."""
+    """C MuJoCo with the model ``reduced``, or with ``stock``, whose states are in double precision."""
     silence_warnings()
     stepper = Stepper(load_model(name), SUBSTEPS[name])
     if name == "stock":
@@ -189,7 +190,7 @@ def native_physics(name: str) -> Physics:
 
 
 def _exact_physics(name: str, stepper: ExactStepper) -> Physics:
-    """The C engine with states in double precision."""
+    """C MuJoCo with states in double precision."""
     splits = tuple(np.cumsum(stepper.sizes)[:-1].tolist())
     call = in_programs(stepper, sum(stepper.sizes), jnp.int32)
 

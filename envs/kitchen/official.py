@@ -1,4 +1,4 @@
-"""FrankaKitchen of gymnasium-robotics, which the kitchen re-implements, as gymnasium makes it."""
+"""FrankaKitchen of gymnasium-robotics, the official program that the kitchen re-implements."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ from envs.official import Official, Played, played
 
 NAME = "FrankaKitchen-v1"
 
-# Noise that FrankaKitchen adds to each component of an observation by default: uniform within ratio times
-# amplitude (``robot_noise_ratio`` of FrankaRobot, ``object_noise_ratio`` of KitchenEnv; amplitudes of
-# franka_config.xml). Its amplitudes of the objects' positions begin one joint too early, with a finger's.
+# The noise that FrankaKitchen adds to each component of an observation by default: uniform within ratio
+# times amplitude (``robot_noise_ratio`` of FrankaRobot, ``object_noise_ratio`` of KitchenEnv; amplitudes of
+# franka_config.xml). Its amplitudes for the objects' positions begin one joint too early, with that of a
+# finger.
 ROBOT_RATIO, OBJECT_RATIO = 0.01, 0.0005
 ROBOT_AMPLITUDE = 0.1  # of positions and of velocities, rad and m
 POSITION_AMPLITUDES = np.repeat([0.1, 0.005, 0.0005, 0.005, 0.1, 0.005, 0.1], [1, 2, 6, 3, 3, 3, 3])
@@ -35,18 +36,18 @@ OBS_NOISE = np.concatenate(
 
 
 def franka_kitchen(horizon: int, **changes: Any) -> Any:
-    """A new FrankaKitchen from ``gymnasium.make``, to be compared with the kitchen here.
+    """Create a FrankaKitchen with ``gymnasium.make`` that is comparable with the kitchen here.
 
-    Noise is off. All five subtasks are to be completed, since the kitchen here counts those outside of a
-    task as well. Each counts once, at its first arrival, and completing them ends nothing: the task's rule
-    and the horizon do.
+    Noise is off. All five subtasks are its goals, since the kitchen here also counts subtasks outside of a
+    task. Each counts once, when it is first completed. Completing them does not end an episode; the task's
+    rule and the horizon do.
 
     Args:
-      horizon: steps after which an episode is truncated.
-      changes: further settings of FrankaKitchen, or others than these.
+      horizon: number of steps after which an episode is truncated.
+      changes: settings of FrankaKitchen to add or to override.
     """
     import_mujoco()
-    gymnasium = _mended_gymnasium()
+    gymnasium = _patched_gymnasium()
     settings = {
         "tasks_to_complete": list(SUBTASKS),
         "remove_task_when_completed": True,
@@ -54,20 +55,20 @@ def franka_kitchen(horizon: int, **changes: Any) -> Any:
         "robot_noise_ratio": 0.0,
         "object_noise_ratio": 0.0,
     }
-    # The checker of gymnasium would warn that observations of two steps share the array of the goals.
+    # gymnasium's checker would warn that the observations of two steps share the array of goals.
     return gymnasium.make(
         NAME, max_episode_steps=horizon, disable_env_checker=True, **{**settings, **changes}
     )
 
 
-def _mended_gymnasium() -> Any:
-    """gymnasium with the environments of gymnasium-robotics 1.4.2, mended for mujoco 3.17.
+def _patched_gymnasium() -> Any:
+    """gymnasium with the environments of gymnasium-robotics 1.4.2, patched for mujoco 3.17.
 
-    Its ``robot_get_obs`` asks whether the type of a joint, a number of numpy, is in a tuple of mujoco's
-    names for types. Such a number and its name no longer compare equal, and an assertion fails. What it
-    returns, the positions and velocities of the robot's joints, is read here without asking for types.
+    ``robot_get_obs`` of gymnasium-robotics asserts that the type of a joint, a numpy integer, is in a tuple
+    of mujoco's enum values. These no longer compare equal, so the assertion fails. The patched function
+    returns the same positions and velocities of the robot's joints without checking types.
     """
-    with contextlib.redirect_stderr(io.StringIO()):  # a notice about environments that are not used
+    with contextlib.redirect_stderr(io.StringIO()):  # hides a notice about unused environments
         import gymnasium
         import gymnasium_robotics
     from gymnasium_robotics.envs.franka_kitchen import franka_env
@@ -87,11 +88,11 @@ def _mended_gymnasium() -> Any:
 class FrankaEpisode:
     """An episode of FrankaKitchen on one task.
 
-    What is complete, and when, is what FrankaKitchen says; only the order that the task wants is added.
+    FrankaKitchen determines which subtasks are complete and when; only the order of the task is added.
 
     Args:
-      task: the order.
-      horizon: steps after which it is truncated.
+      task: the task.
+      horizon: number of steps after which the episode is truncated.
     """
 
     def __init__(self, task: KitchenTask, horizon: int) -> None:
@@ -119,15 +120,16 @@ class FrankaEpisode:
         return num_in_turn([name for name, _ in self._reached], self._order)
 
     def _in_turn(self, names: Sequence[str]) -> list[str]:
-        """Subtasks that arrived in one step, which FrankaKitchen lists in no order: the next one first."""
+        """The subtasks completed in one step, which FrankaKitchen lists in no order; the task's next one
+        first."""
         expected = self._order[self._solved : self._solved + 1]
         return sorted(names, key=lambda name: (name not in expected, SUBTASKS.index(name)))
 
 
 def num_in_turn(completed: Sequence[str], order: Sequence[str]) -> int:
-    """How many subtasks of an order were completed in their turn, none of the later ones before them.
+    """The number of subtasks that were completed in order, before any later one of the order.
 
-    Subtasks outside of the order do not matter.
+    Subtasks outside of the order are ignored.
     """
     of_task = [name for name in completed if name in order]
     in_turn = takewhile(lambda pair: pair[0] == pair[1], zip(of_task, order, strict=False))
@@ -140,14 +142,14 @@ def subtasks_of(task: KitchenTask) -> list[str]:
 
 
 def goal_name(goal: np.ndarray) -> str:
-    """The subtasks of a goal; numbers, where an optimizer has made them up."""
+    """The names of the subtasks of a goal; its numbers, if an optimizer has invented the goal."""
     if not np.isin(goal, (0, 1)).all():
         return " ".join(f"{number:.2f}" for number in goal)
     return " and ".join(SUBTASKS[index] for index in np.flatnonzero(goal))
 
 
 def kitchen_official(env: Kitchen) -> Official:
-    """FrankaKitchen, for the horizon of a kitchen."""
+    """The record of FrankaKitchen, with the horizon of a kitchen."""
     return Official(
         name=f"{NAME} of gymnasium-robotics {version('gymnasium-robotics')}",
         episode=lambda task: FrankaEpisode(task, env.horizon),

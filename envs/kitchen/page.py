@@ -1,4 +1,4 @@
-"""What the kitchen brings to HTML pages: names. Its physics cannot be played in a page."""
+"""The kitchen's part of HTML pages: only names, since its physics cannot be simulated in a page."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from envs.page import Page
 
 
 def kitchen_page(env: Kitchen) -> Page:
-    """The names of the subtasks; all engines of the kitchen look the same."""
+    """The names of the subtasks, which are the same for all engines."""
     del env
     return Page(describe=describe, parts=SUBTASKS)
 

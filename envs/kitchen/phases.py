@@ -1,6 +1,6 @@
-"""The plan of the kitchen's demonstrator: what the hand does, phase by phase, to complete each subtask.
+"""The plan of the kitchen's demonstrator: the phases in which the hand completes each subtask.
 
-All poses are angles of the seven joints of the arm, in rad.
+All poses are angles of the arm's seven joints, in rad.
 """
 
 from __future__ import annotations
@@ -11,13 +11,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Int
 
-OPEN, CLOSED = 0.04, 0.0  # m, of each finger
-HOME = (0.148, -1.768, 1.844, -2.477, 0.26, 0.713, 1.595)  # where tries start again
+OPEN, CLOSED = 0.04, 0.0  # m, position of each finger
+HOME = (0.148, -1.768, 1.844, -2.477, 0.26, 0.713, 1.595)  # the pose from which tries are repeated
 ASIDE = (0.14, -1.63, -0.35, -2.78, -0.39, 1.17, 0.01)  # right of an open hinge door
-# Phase that each subtask's second try, fourth try and so on start at: grasps go on from where the hand is.
+# The phase at which the second, fourth, .. try of each subtask starts; grasps continue from the hand's
+# current pose.
 RETRY = (0, 0, 0, 2, 2)
 
-# Phases are written with numbers and tuples; in the table of all phases every field is an array.
+# Single phases are written with numbers and tuples; in the table of all phases every field is an array.
 Number = Any
 Vector = Any
 
@@ -25,8 +26,8 @@ Vector = Any
 class Phase(NamedTuple):
     """One movement of the hand.
 
-    The target of the tip is a point that is fixed to the object: where ``point`` would be if the object's
-    joint were ``lead`` further than it is (but within ``joint_range``). To this, ``offset`` is added, along
+    The target of the tip is a point fixed to the object: the place where ``point`` would be if the object's
+    joint were ``lead`` further than it is (but within ``joint_range``). To this, ``offset`` is added along
     the right, forward and upward directions of the hand. Lengths are in m, angles in rad; an object's joint
     is in rad, the slide cabinet's in m.
     """
@@ -36,11 +37,11 @@ class Phase(NamedTuple):
     lead: Number = 0.0
     joint_range: Vector = (-9.0, 9.0)
     yaw: Number = 0.0
-    """Of the hand about the vertical; 0 faces the cabinets."""
+    """Angle of the hand about the vertical; 0 faces the cabinets."""
     yaw_rate: Number = 0.0
-    """Added yaw per joint position."""
+    """Additional yaw per joint position of the object."""
     pitch: Number = 0.0
-    """Downward."""
+    """Downward angle of the hand."""
     grip: Number = CLOSED
     """Position of each finger."""
     tolerance: Number = 0.0
@@ -48,13 +49,13 @@ class Phase(NamedTuple):
     turn_tolerance: Number = 9.0
     """Angle to the target's orientation at which the phase may end."""
     steps: Number = 20
-    """After which the phase ends at the latest."""
+    """Largest number of steps of the phase."""
     stop: Number = 9.0
-    """Joint position at which the phase ends, counted in the direction of motion."""
+    """Joint position of the object at which the phase ends, measured in the direction of motion."""
     lost: Number = 9.0
-    """Distance at which the hand has lost the object."""
+    """Distance from ``point`` beyond which the hand has lost the object."""
     speed: Number = 0.06
-    """m in a step."""
+    """Largest distance of a step, m."""
     turning: Number = 0.3
     """Weight of rotation against translation, m / rad."""
     joint_move: Number = False
@@ -133,7 +134,7 @@ def _hinge() -> list[Phase]:
 
 
 def _microwave() -> list[Phase]:
-    """Grasp the handle from above, since the arm does not reach down to it level, and pull."""
+    """Grasp the handle from above, since the arm cannot reach it horizontally, and pull."""
     hand = Phase(point=(0.475, -0.108, 0.05), yaw=0.3, yaw_rate=0.6, pitch=0.6, grip=OPEN)
     pulling = hand._replace(offset=(0, 0.01, 0), turning=0.15)
     pose = (-1.02, -1.29, 2.13, -1.99, 0.13, 1.63, 1.34)
@@ -156,16 +157,16 @@ def _microwave() -> list[Phase]:
 
 
 class Plan(NamedTuple):
-    """The phases of all subtasks: every field has shape ``[5, P]``, and one more axis for vectors."""
+    """The phases of all subtasks; the fields have shape ``[5, P]``, vectors one more axis."""
 
     phases: Phase
     num_phases: Int[np.ndarray, "S"]
-    """How many of the P phases a subtask has."""
+    """The number of phases of each subtask, at most P."""
 
 
 @cache
 def make_plan() -> Plan:
-    """All subtasks' phases in one table. Phase 0 leads to ``HOME``; first tries begin with phase 1."""
+    """The phases of all subtasks in one table. Phase 0 leads to ``HOME``; first tries begin at phase 1."""
     hub = _move_to(HOME, OPEN, 0.45, 20)
     lists = [[hub, *phases()] for phases in (_burner, _light, _slide, _hinge, _microwave)]
     longest = max(map(len, lists))

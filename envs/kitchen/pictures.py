@@ -1,4 +1,4 @@
-"""Pictures of the kitchen, drawn by MuJoCo without a window from what was observed."""
+"""Pictures of the kitchen, rendered off-screen by MuJoCo from observations."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from envs.kitchen.extra import NoOpenGLError, import_mujoco
 
 CAMERA = {"distance": 2.2, "azimuth": 70.0, "elevation": -35.0, "lookat": (-0.2, 0.5, 2.0)}
 NAMES = ("burner", "light", "slide", "hinge", "microwave")  # of the subtasks
-REST = 25  # steps that are shown after the last completed subtask
-IN_ORDER = "\N{CHECK MARK}"  # behind subtasks whose completion was rewarded
+REST = 25  # number of steps that are shown after the last completed subtask
+IN_ORDER = "\N{CHECK MARK}"  # follows subtasks whose completion was rewarded
 NO_BREAK = "\N{NO-BREAK SPACE}"  # keeps a goal of several subtasks on one line
 
 
 def kitchen_pictures(env: Kitchen) -> Pictures:
-    """A GIF of one task, and a still of the scene; all engines of the kitchen look the same."""
+    """A GIF of one task, and an image of the scene, which are the same for all engines."""
     del env
     return Pictures(video=write_video, frame=kitchen_frame, another_order=True)
 
 
 def write_video(path: Path, task: Task, shown: Sequence[Shown]) -> None:
-    """Episodes on one task side by side.
+    """Write a video of episodes on one task, side by side.
 
     Raises:
-      UsageError: where there is no OpenGL to draw with.
+      UsageError: if there is no OpenGL for rendering.
     """
     order = [NAMES[subtask] for subtask in task.order if subtask != NONE]
     title = f"Task, in an order that is not told: {', '.join(order)}  ({IN_ORDER} in order)"
@@ -46,10 +46,10 @@ def write_video(path: Path, task: Task, shown: Sequence[Shown]) -> None:
 def kitchen_frames(
     obs: Float[np.ndarray, "T 59"], height: int = 480, width: int = 640
 ) -> UInt8[np.ndarray, "T H W 3"]:
-    """What the scene looks like at each of these observations.
+    """Render the scene at each of T observations.
 
     Raises:
-      NoOpenGLError: where there is no OpenGL to draw with.
+      NoOpenGLError: if there is no OpenGL for rendering.
       MissingExtraError: if the packages of the kitchen are missing.
     """
     mujoco = import_mujoco()
@@ -77,7 +77,7 @@ def kitchen_frames(
 
 
 def kitchen_frame(obs: Float[np.ndarray, "59"]) -> UInt8[np.ndarray, "H W 3"]:
-    """What the scene looks like at one observation; raises as ``kitchen_frames``."""
+    """Render the scene at one observation; raises the same errors as ``kitchen_frames``."""
     return kitchen_frames(np.asarray(obs)[None])[0]
 
 
@@ -86,15 +86,15 @@ class Panel(NamedTuple):
 
     title: str
     obs: Float[np.ndarray, "T 59"]
-    """What was observed at the start and after each step."""
+    """The observations at the start and after each step."""
     completed: Sequence[tuple[int, str]]
-    """What was completed, and after how many steps."""
+    """The completed subtasks, each as the number of steps and its name."""
 
 
 def kitchen_gif(
     path: Path, title: str, panels: Sequence[Panel], height: int = 216, width: int = 288
 ) -> None:
-    """Episodes side by side below a title; those that end earlier stand still."""
+    """Write a GIF of episodes side by side below a title; those that end earlier stop at their end."""
 
     def film(panel: Panel) -> Film:
         def caption(time: int) -> str:
@@ -112,7 +112,7 @@ def kitchen_gif(
 
 
 def panel_of(shown: Shown) -> Panel:
-    """An episode as what it looked like, until soon after the last subtask was completed."""
+    """The observations of an episode until ``REST`` steps after the last completed subtask."""
     trajectory, rewards = shown.episode.trajectory, shown.episode.rewards
     completed = []
     for time in np.flatnonzero(trajectory.goal_reached[: trajectory.length]):
@@ -125,7 +125,8 @@ def panel_of(shown: Shown) -> Panel:
 
 
 def words(goals: np.ndarray) -> str:
-    """A prompt in words; goals that are no subtasks (some methods move goals) by their numbers."""
+    """A prompt as text; goals that are not subtasks (some methods move goals) are shown by their
+    numbers."""
     return " > ".join(_word(goal) for goal in goals)
 
 

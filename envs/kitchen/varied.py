@@ -1,10 +1,9 @@
-"""The kitchen with a scene and physics that are drawn for each episode, so that demonstrations of it teach
-nothing that only holds in one simulator (domain randomization, Tobin et al. 2017).
+"""The kitchen with randomized scenes and physics, so that demonstrations do not depend on one simulator.
 
-An episode takes place in the stock scene, as it is, or in the reduced scene with other friction, softness
-of contacts, damping, places of the handles and a start that is a little off. The draw is a part of the
-task, and whoever acts does not see it. A state is written in the coordinates of the full scene, whichever
-scene it is of.
+This is domain randomization (Tobin et al. 2017). An episode takes place either in the unmodified stock
+scene, or in the reduced scene with randomized friction, softness of contacts, damping, places of the
+handles and initial joint angles. The draw is a part of the task and is hidden from the agent. States are in
+the coordinates of the full scene, whichever scene they belong to.
 """
 
 from __future__ import annotations
@@ -35,20 +34,21 @@ from envs.kitchen.model import (
 from envs.kitchen.native import Stepper, in_programs, silence_warnings
 from envs.kitchen.physics import MODELS, Either, Physics, position_targets
 
-# Half widths of the uniform distributions of what is drawn in the reduced scene.
-FRICTION = 0.3  # of the factor on the sliding friction of all contacts
-SOFTNESS = 0.3  # of the factor on the time in which a contact recovers from penetration
-DAMPING = 0.2  # of the factors on the damping of each joint
-HANDLE = 0.01  # m, of the displacement of each object's collision shapes, in each direction
-START = 0.02  # rad, of the displacement of each joint of the arm at the start
-STOCK_SHARE = 0.7  # of the episodes are in the stock scene
+# Half widths of the uniform distributions in the reduced scene.
+FRICTION = 0.3  # factor on the sliding friction of all contacts
+SOFTNESS = 0.3  # factor on the time in which a contact recovers from penetration
+DAMPING = 0.2  # factors on the damping of each joint
+HANDLE = 0.01  # m, displacement of each object's collision shapes in each direction
+START = 0.02  # rad, displacement of each joint of the arm at the start
+STOCK_SHARE = 0.7  # fraction of the episodes that are in the stock scene
 
 NUM_JOINTS = len(ARM_JOINTS)
 VARIED_FIELDS = ("pair_friction", "pair_solref", "dof_damping", "geom_pos")
 
 
 class Variation(NamedTuple):
-    """The scene and physics of an episode. In the stock scene all but ``scene`` is without effect."""
+    """The scene and physics of an episode. In the stock scene all fields except for ``scene`` have no
+    effect."""
 
     scene: Int[Either, "*batch"]
     """Index into ``MODELS``."""
@@ -56,31 +56,31 @@ class Variation(NamedTuple):
     softness: Float[Either, "*batch"]
     damping: Float[Either, "*batch V"]
     handles: Float[Either, "*batch S 3"]
-    """Displacements of the shapes that the objects collide with, in the frames of their bodies, m."""
+    """Displacements of the objects' collision shapes, in the frames of their bodies, m."""
     start: Float[Either, "*batch J"]
     """Displacements of the arm's joints at the start, rad."""
 
 
 class VariedTask(NamedTuple):
-    """An order of subtasks, and the scene and physics that it has to be completed in."""
+    """An order of subtasks, and the scene and physics of the episode."""
 
     order: Int[Array, "*batch S"]
     variation: Variation
 
 
 class VariedState(NamedTuple):
-    """Everything that the next step depends on, float32."""
+    """Everything that the next step depends on, in float32."""
 
     qpos: Float[Array, "*batch 30"]
     qvel: Float[Array, "*batch 29"]
     warmstart: Float[Array, "*batch 29"]
     variation: Float[Array, "*batch P"]
-    """What physics needs of the variation, in one row (``_packed``)."""
+    """The part of the variation that physics depends on, as one row (``_packed``)."""
 
 
 @dataclass(frozen=True)
 class VariedKitchen(Kitchen):
-    """The kitchen whose tasks also tell scene and physics; it is stepped by C MuJoCo.
+    """The kitchen whose tasks also determine the scene and the physics; it is stepped by C MuJoCo.
 
     Attributes:
       stock_share: probability of the stock scene.
@@ -94,15 +94,15 @@ class VariedKitchen(Kitchen):
         return varied_physics()
 
     def sample_task(self, key: PRNGKeyArray) -> Task:
-        """A random order in a random scene."""
+        """A random order of subtasks in a random scene."""
         return self.varied(key, super().sample_task(key))
 
     def varied(self, key: PRNGKeyArray, task: KitchenTask) -> VariedTask:
-        """The order of a task in a random scene."""
+        """The order of ``task`` in a random scene."""
         return VariedTask(task.order, draw_variation(jax.random.fold_in(key, 1), self.stock_share))
 
     def scene(self, task: VariedTask) -> Int[Either, ""]:
-        """Which of ``MODELS`` a task is of."""
+        """The index into ``MODELS`` of a task's scene."""
         return task.variation.scene
 
     def initial_physics(self, task: VariedTask) -> VariedState:
@@ -110,7 +110,7 @@ class VariedKitchen(Kitchen):
 
 
 def settings(env: VariedKitchen) -> tuple[tuple[str, float], ...]:
-    """Names and values of what the draws of a world depend on."""
+    """Names and values of the settings that the draws depend on."""
     return (
         ("stock_share", env.stock_share),
         ("friction", FRICTION),
@@ -139,8 +139,8 @@ def draw_variation(key: PRNGKeyArray, stock_share: float = STOCK_SHARE) -> Varia
 
 
 def start_of(variation: Variation) -> VariedState:
-    """The physics at the start of an episode, at rest."""
-    reduced, stock = (_start_in_the_full_scene(name) for name in MODELS)
+    """The physics state at the start of an episode, at rest."""
+    reduced, stock = (_initial_positions(name) for name in MODELS)
     is_stock = variation.scene == MODELS.index("stock")
     shift = jnp.where(is_stock, 0.0, variation.start)
     rest = jnp.asarray(initial_state("stock").qvel)
@@ -153,20 +153,20 @@ def start_of(variation: Variation) -> VariedState:
 
 
 @cache
-def _start_in_the_full_scene(name: str) -> Float[np.ndarray, "30"]:
-    """Where a model's episodes start, in the coordinates of the full scene."""
+def _initial_positions(name: str) -> Float[np.ndarray, "30"]:
+    """The initial positions of a model's episodes, in the coordinates of the full scene."""
     return np.asarray(scene_coordinates(name)[0].expand(initial_state(name).qpos))
 
 
 def _packed(variation: Variation) -> Float[Array, "P"]:
-    """What physics needs of a variation, as one row."""
+    """The part of a variation that physics depends on, as one row of P numbers."""
     parts = (variation.scene, variation.friction, variation.softness)
     numbers = [jnp.asarray(part, jnp.float32)[None] for part in parts]
     return jnp.concatenate([*numbers, variation.damping, variation.handles.ravel()])
 
 
 def _unpacked(rows: np.ndarray) -> Variation:
-    """The variations of N rows; the start is not in them."""
+    """The variations in N rows of ``_packed``, without their starts."""
     ends = np.cumsum([1, 1, 1, load_model("reduced").nv])
     scene, friction, softness, damping, handles = np.split(rows, ends, axis=1)
     return Variation(
@@ -183,7 +183,7 @@ def varied_fields(model: mujoco.MjModel, variation: Variation) -> dict[str, np.n
     """The fields ``VARIED_FIELDS`` of the reduced model for each of N variations."""
     num = len(variation.scene)
     friction = np.repeat(model.pair_friction[None], num, axis=0)
-    friction[:, :, :2] *= variation.friction[:, None, None]  # the two against sliding
+    friction[:, :, :2] *= variation.friction[:, None, None]  # the two sliding directions
     solref = np.repeat(model.pair_solref[None], num, axis=0)
     solref[:, :, 0] *= variation.softness[:, None]
     places = np.repeat(model.geom_pos[None], num, axis=0)
@@ -198,7 +198,7 @@ def varied_fields(model: mujoco.MjModel, variation: Variation) -> dict[str, np.n
 
 
 def _shapes_of(model: mujoco.MjModel) -> list[tuple[int, int]]:
-    """The shapes that the objects collide with, and the subtask whose object each belongs to."""
+    """The collision shapes of the objects, each with the subtask of its object."""
     joints = [int(model.joint(name).id) for name in OBJECT_JOINTS]
     bodies = [int(model.jnt_bodyid[joint]) for joint in joints]
     geoms = [int(model.geom(capsule.name).id) for capsule in (KNOB, *HANDLES)]
@@ -220,9 +220,9 @@ class VariedStepper:
         self.sizes = self._steppers["stock"].sizes
 
     def __call__(self, rows: Array | np.ndarray) -> np.ndarray:
-        """New positions, velocities and warm starts ``[..., 88]`` of rows ``[..., 88 + P + 9 + 1]``.
+        """The new positions, velocities and warm starts ``[..., 88]`` of rows ``[..., 88 + P + 9 + 1]``.
 
-        A row holds positions, velocities, warm start, the variation, controls and whether to step at all.
+        A row holds positions, velocities, warm start, variation, controls and whether to step at all.
         """
         flat, width = np.asarray(rows).reshape(-1, rows.shape[-1]), sum(self.sizes)
         num_controls = self._models["stock"].nu
@@ -245,7 +245,7 @@ class VariedStepper:
         active: Bool[np.ndarray, "B"],
         variation: Variation,
     ) -> Float[np.ndarray, "B N"]:
-        """A control step of the active worlds, all of which are of one model."""
+        """Take a control step in the active worlds, all of which have the same model."""
         stepper, splits = self._steppers[name], np.cumsum(self.sizes)[:-1]
         joints, dofs = self._addresses[name]
         places = (joints, dofs, dofs)

@@ -23,7 +23,8 @@ def make15() -> MazeRunner:
 
 
 def make30() -> MazeRunner:
-    """The paper calls its size 30; walls lie on even cells, so a side is odd."""
+    """The paper calls its size 30; the side is 31, since walls are on even cells and a side is therefore
+    odd."""
     from envs.maze.env import MazeRunner
 
     return MazeRunner(name="maze30", side=31, horizon=500)
@@ -53,7 +54,7 @@ MAZE15 = World(
     summary="MazeRunner: find a goal in an unknown maze of 15 x 15 cells within 64 steps",
     demonstrators=load_demonstrators,
     presets={
-        # 10,000 trajectories are soon overfitted; 100,000 are not, and take a minute to collect.
+        # A policy soon overfits 10,000 trajectories, but not 100,000, which take a minute to collect.
         "fast": {"steps": 8_000, "trajectories": 100_000},
         "paper": {"steps": 50_000, "trajectories": 10_000},  # steps as in the authors' code
         "ablation": {"steps": 2_000, "trajectories": 10_000},

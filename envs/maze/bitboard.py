@@ -1,8 +1,8 @@
-"""Shortest paths on grids, many cells to a machine word.
+"""Shortest paths on grids by bitboards, with many cells in a machine word.
 
-A set of cells is a board of ``S`` rows, each row the bits of one ``uint32``, so that a side has at most 32
-cells. One step of a breadth-first search takes a few shifts of the whole board. This makes it cheap enough
-to plan anew at every step in thousands of mazes at once.
+A set of cells is a board of ``S`` rows. Each row is the bits of one ``uint32``, so that a side has at most
+32 cells. One step of a breadth-first search takes a few shifts of the whole board, which is cheap enough to
+replan at every step in thousands of mazes at once.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, UInt32
 
 MAX_SIDE = 32
-# A search checks whether it has ended only after every ROUND steps, a power of two.
+# A search checks for termination only after every ROUND steps, a power of two.
 ROUND_BITS = 3
 ROUND = 1 << ROUND_BITS
 
 
 def pack(cells: Bool[Array, "S S"]) -> UInt32[Array, "S"]:
-    """Boolean cells as one word for each row; bit ``c`` is column ``c``."""
+    """Pack boolean cells into one word for each row; bit ``c`` is column ``c``."""
     if cells.shape[0] > MAX_SIDE:
         raise ValueError(f"grids are limited to {MAX_SIDE} cells a side, found {cells.shape[0]}")
     columns = jnp.arange(cells.shape[1], dtype=jnp.uint32)
@@ -47,25 +47,25 @@ def spread(board: UInt32[Array, "S"]) -> UInt32[Array, "S"]:
 
 
 class _Distances(NamedTuple):
-    """A search for the distances of all cells.
+    """The state of a search for the distances of all cells.
 
-    A cell that was found in step s (counted from 0) is in the boards of those bits that s has in binary.
+    A cell that is found in step s (counted from 0) is in the boards of those bits that are set in s.
     """
 
     reached: UInt32[Array, "S"]
     grows: Bool[Array, ""]
     """Whether the last round found new cells."""
     low: tuple[UInt32[Array, "S"], ...]
-    """Boards of the low bits, which number the steps within a round."""
+    """Boards of the low bits of s, which count the steps within a round."""
     high: UInt32[Array, "H S"]
-    """Boards of the high bits, which number the rounds."""
+    """Boards of the high bits of s, which count the rounds."""
     round: Int[Array, ""]
 
 
 def distances(free: Bool[Array, "S S"], source: Int[Array, "2"]) -> Int[Array, "S S"]:
-    """Steps of the shortest free path from ``source`` to every cell, -1 where there is none.
+    """The length of the shortest free path from ``source`` to every cell, -1 if there is none.
 
-    The source counts as free. Under ``vmap`` all lanes search until the last one has ended.
+    The source counts as free. Under ``vmap`` all lanes search until the last one is done.
     """
     side = free.shape[0]
     origin = single(source, side)
@@ -74,7 +74,7 @@ def distances(free: Bool[Array, "S S"], source: Int[Array, "2"]) -> Int[Array, "
 
     def one_round(search: _Distances) -> _Distances:
         reached, low = search.reached, list(search.low)
-        for step in range(ROUND):  # unrolled: the low bits of a step are known to the compiler
+        for step in range(ROUND):  # unrolled, so that the low bits of a step are static
             grown = spread(reached) & open_
             new = grown & ~reached
             low = [bits | new if step >> b & 1 else bits for b, bits in enumerate(low)]
@@ -103,11 +103,11 @@ def distances(free: Bool[Array, "S S"], source: Int[Array, "2"]) -> Int[Array, "
 
 
 class _Toward(NamedTuple):
-    """A search from the target until it meets a neighbor of the source."""
+    """The state of a search from the target until it meets a neighbor of the source."""
 
     reached: UInt32[Array, "S"]
     found: UInt32[Array, "S"]
-    """The neighbors that it met first."""
+    """The neighbors of the source that it met first."""
     goes_on: Bool[Array, ""]
 
 
@@ -116,7 +116,7 @@ def toward(
 ) -> Bool[Array, "S S"]:
     """The neighbors of ``source`` on shortest free paths from it to another cell ``target``.
 
-    None if the target is cut off.
+    The result is empty if the target cannot be reached.
     """
     side = free.shape[0]
     origin = single(target, side)

@@ -1,13 +1,13 @@
 """Demonstrators of MazeRunner: "A*-n" and "Random" (paper, appendices B.3 and C.1).
 
-Both know only what their four rays have shown them. A*-n visits n random goals: a goal on the
-known map is approached on the shortest known path; otherwise the demonstrator walks to the seen but
-unvisited cell that minimizes G + H, the known path to it plus its Manhattan distance to the goal. It
-chooses anew on arrival and whenever a goal is reached; ties go to the cell nearest to the goal.
-Random walks to one of the five nearest seen but unvisited cells.
+Both know only what their four rays have shown them. A*-n visits n random goals. If the goal is on the known
+map, the demonstrator takes the shortest known path to it. Otherwise it walks to the seen but unvisited cell
+that minimizes G + H, the length of the known path to the cell plus its Manhattan distance to the goal; ties
+are broken in favor of the cell nearest to the goal. It chooses a new cell on arrival, and whenever a goal
+is reached. Random walks to one of the five nearest cells that are seen but unvisited.
 
-Known maps are bitboards (``envs.maze.bitboard``). The path to the chosen cell is re-read from the known map
-at every step, so that a shortcut seen on the way is taken.
+Known maps are bitboards (``envs.maze.bitboard``). The path to the chosen cell is recomputed from the known
+map at every step, so that shortcuts seen along the way are taken.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ MIN_LENGTH = 20  # shorter demonstrations are dropped
 
 
 class Memory(NamedTuple):
-    """What a demonstrator remembers within an episode."""
+    """The memory of a demonstrator within an episode."""
 
     seen: Bool[Array, "S S"]
-    """Free cells seen so far, the visited ones included."""
+    """Free cells seen so far, including visited ones."""
     visited: Bool[Array, "S S"]
     goals: Int[Array, "N 2"]
     num_reached: Int[Array, ""]
     target: Int[Array, "2"]
-    """The cell it is walking to."""
+    """The cell that it is walking to."""
 
 
-# (key, memory, steps to every known cell) -> the next cell to walk to, whether there is none
+# (key, memory, steps to every known cell) -> (the next cell to walk to, whether there is none)
 ChooseTarget = Callable[[PRNGKeyArray, Memory, Array], tuple[Array, Array]]
 
 
@@ -64,7 +64,7 @@ def astar(env: MazeRunner, num_goals: int) -> Agent:
         goal = memory.goals[jnp.minimum(memory.num_reached, num_goals - 1)]
         index = jnp.arange(side)
         manhattan = abs(index - goal[0])[:, None] + abs(index - goal[1])[None, :]
-        # Among cells of equal G + H the one nearest to the goal.
+        # Of cells with equal G + H, the one nearest to the goal.
         score = (steps + manhattan) * side**2 + manhattan
         cell = jnp.argmin(jnp.where(_frontier(memory, steps), score, FAR))
         frontier_cell = jnp.stack([cell // side, cell % side])
@@ -91,7 +91,7 @@ def _frontier(memory: Memory, steps: Array) -> Bool[Array, "S S"]:
 
 
 def _explorer(env: MazeRunner, num_goals: int, choose: ChooseTarget) -> Agent:
-    """An agent that walks from target to target over what it has seen."""
+    """An agent that walks from target to target through known cells."""
     side = env.side
 
     def draw_goals(key: PRNGKeyArray, task: MazeTask) -> Int[Array, "N 2"]:
@@ -117,7 +117,7 @@ def _explorer(env: MazeRunner, num_goals: int, choose: ChooseTarget) -> Agent:
     def proceed(
         key: PRNGKeyArray, memory: Memory, state: MazeState, timestep: TimeStep
     ) -> tuple[Array, Array, Memory]:
-        del timestep  # the rays below are its observation, as cells
+        del timestep  # it observes the cells on its rays instead, see below
         position = state.position
         visited = memory.visited.at[tuple(position)].set(True)
         seen = memory.seen | cells_in_sight(state.task.maze, position)
@@ -141,14 +141,15 @@ def _explorer(env: MazeRunner, num_goals: int, choose: ChooseTarget) -> Agent:
 
 
 def first_hit_return(trajectory: Trajectory) -> Float[Array, ""]:
-    """The return of a trajectory on the task whose goal is where the trajectory ends."""
+    """The return in hindsight, on the task whose goal is the cell where the trajectory ends."""
     goals = trajectory.achieved_goals
     arrived = jnp.all(goals == goals[trajectory.length - 1], axis=-1)
     return GOAL_REWARD - STEP_PENALTY * (1 + jnp.argmax(arrived))
 
 
 def maze_demonstrators(env: MazeRunner) -> dict[str, Demonstrator]:
-    """The datasets of Table 5 by name, the one of the paper's main results first."""
+    """The demonstrators of the datasets in Table 5, by name; that of the paper's main results comes
+    first."""
 
     def endless_task(key: PRNGKeyArray, index: Int[Array, ""]) -> MazeTask:
         """A random maze whose goal is a wall, so that only the demonstrator ends the episode."""

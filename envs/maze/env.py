@@ -1,7 +1,7 @@
 """MazeRunner: find the way to a goal in an unknown maze, seeing only along four rays.
 
-Paper, appendix C.1; the exact rules are those of the authors' environment (AMAGO's MazeRunner with a
-step penalty). Rows count downwards, columns to the right; north is row - 1. The observation is
+Source: paper, appendix C.1; the exact rules are those of the authors' environment (AMAGO's MazeRunner with
+a step penalty). Rows are counted downwards, columns to the right; north is row - 1. The observation is
 ``(row, column, free cells to the west, north, east, south) / side``.
 """
 
@@ -26,7 +26,7 @@ GOAL_REWARD = 1.0
 
 
 class MazeTask(NamedTuple):
-    """A maze and where to go in it."""
+    """A maze and the goal in it."""
 
     maze: Int[Array, "*batch S S"]
     """1 is a wall, 0 is free."""
@@ -66,11 +66,11 @@ class MazeRunner(Environment):
 
     @property
     def start(self) -> tuple[int, int]:
-        """Row and column where every episode starts: inside the corridor at the bottom."""
+        """Row and column at which every episode starts, in the corridor at the bottom."""
         return (self.side - 2, self.side // 2)
 
     def sample_task(self, key: PRNGKeyArray) -> MazeTask:
-        """A random maze with a goal that is uniform over the free cells that can be reached."""
+        """A random maze and a goal drawn uniformly from the reachable free cells."""
         key_maze, key_goal = jax.random.split(key)
         maze = generate_maze(key_maze, self.side)
         reachable = distances(maze == 0, jnp.asarray(self.start)) >= 0
@@ -79,19 +79,19 @@ class MazeRunner(Environment):
         return MazeTask(maze=maze, goal=jnp.stack([cell // self.side, cell % self.side]))
 
     def sample_goal(self, key: PRNGKeyArray) -> Float[Array, "2"]:
-        """Any cell inside of the border, a wall or not."""
+        """A random cell within the border, whether it is a wall or not."""
         cell = jax.random.randint(key, (2,), 1, self.side - 1)
         return self.goal_at(cell)
 
     @property
     def goal_set(self) -> np.ndarray:
-        """All cells inside of the border, walls or not: a maze is not known beforehand."""
+        """All cells within the border, including walls, since the maze is not known beforehand."""
         inner = self.side - 2
         cells = 1 + np.stack(np.divmod(np.arange(inner**2), inner), axis=1)
         return (cells / self.side).astype(np.float32)
 
     def expert_goal(self, state: MazeState, num_steps: int) -> Float[Array, "2"]:
-        """The cell on a shortest path that many steps ahead, or the goal."""
+        """The cell ``num_steps`` ahead on a shortest path, or the goal if that is nearer."""
         steps_left = distances(state.task.maze == 0, state.task.goal)
 
         def walk(index: Array, cell: Array) -> Array:
@@ -110,20 +110,20 @@ class MazeRunner(Environment):
         return self.goal_at(task.goal)
 
     def optimal_return(self, task: MazeTask) -> Float[Array, ""]:
-        """1 - 0.1 x steps of the shortest path; the worst return where the goal is out of reach."""
+        """1 - 0.1 x steps of the shortest path; the worst return if the goal cannot be reached."""
         length = self._shortest_path(task)
         best = GOAL_REWARD - STEP_PENALTY * length
         return jnp.where(self._in_reach(length), best, -STEP_PENALTY * self.horizon)
 
     def solvable(self, task: MazeTask) -> Bool[Array, ""]:
-        """Whether the last of the horizon's steps can reach the goal."""
+        """Whether the goal can be reached within the horizon."""
         return self._in_reach(self._shortest_path(task))
 
     def _in_reach(self, length: Int[Array, ""]) -> Bool[Array, ""]:
         return (length >= 0) & (length <= self.horizon)
 
     def _shortest_path(self, task: MazeTask) -> Int[Array, ""]:
-        """Steps from the start to the goal; -1 where it is cut off."""
+        """Steps from the start to the goal; -1 if it cannot be reached."""
         return distances(task.maze == 0, jnp.asarray(self.start))[tuple(task.goal)]
 
     @partial(jax.jit, static_argnums=0)  # compiled once for both checks of the same tasks
@@ -200,7 +200,7 @@ class MazeRunner(Environment):
 
 
 def free_cells(maze: Int[Array, "S S"], position: Int[Array, "2"]) -> Int[Array, "4"]:
-    """How many free cells lie to the west, north, east and south before the first wall."""
+    """The number of free cells to the west, north, east and south, up to the first wall."""
     side = maze.shape[0]
     line = jnp.arange(side)
 
@@ -226,29 +226,29 @@ def cells_in_sight(maze: Int[Array, "S S"], position: Int[Array, "2"]) -> Bool[A
 
 
 class _Walk(NamedTuple):
-    """A maze that is being built; nodes are its even cells, counted in twos."""
+    """The state of a maze under construction; nodes are its even cells, with half their coordinates."""
 
     maze: Int[Array, "S S"]
     node: Int[Array, "2"]
-    """Where the present wall has grown to."""
+    """The end of the current wall."""
     looks_left: Int[Array, ""]
-    """Looks around that the present wall has left."""
+    """Number of looks that the current wall has left."""
     islands_left: Int[Array, ""]
-    """Walls that are still to begin; -1 once the last one has grown."""
+    """Number of walls that have not begun yet; -1 once the last one is complete."""
     key: PRNGKeyArray
 
 
 def generate_maze(
     key: PRNGKeyArray, side: int, complexity: float = 0.75, density: float = 0.75
 ) -> Int[Array, "S S"]:
-    """A maze of the classic "mazelab" random walk, with MazeRunner's start area; 1 is a wall.
+    """Generate a maze by the classic "mazelab" random walk, with MazeRunner's start area; 1 is a wall.
 
-    The classic procedure picks ``density * (side // 2)**2`` times an even cell, makes it a wall and
-    grows a wall from it: ``complexity * 10 * side`` times it looks at a random even cell two steps
-    away and, if that is free, walls it with the cell between and goes on from there. Most looks find
-    a wall and change nothing. Here one loop step is one *change*: the number of looks until then is
-    drawn from its geometric distribution. The mazes have the same distribution and take far fewer
-    loop steps.
+    The classic procedure repeats the following ``density * (side // 2)**2`` times: it makes a random even
+    cell a wall, and grows a wall from it. For this it looks ``complexity * 10 * side`` times at a random
+    even cell two steps away. If that cell is free, it becomes a wall together with the cell between, and
+    the wall continues from there. Most looks find a wall and change nothing. Here every loop step is one
+    *change*: the number of looks until the next change is drawn from its geometric distribution. The mazes
+    have the same distribution, but need far fewer loop steps.
     """
     num_islands = int(density * (side // 2) * (side // 2))
     num_looks = int(complexity * 5 * (side + side))
@@ -257,7 +257,7 @@ def generate_maze(
     start = _Walk(
         maze=border,
         node=jnp.zeros(2, jnp.int32),
-        looks_left=jnp.int32(0),  # so that the first change begins the first wall
+        looks_left=jnp.int32(0),  # the first change then begins the first wall
         islands_left=jnp.int32(num_islands),
         key=key,
     )
@@ -268,14 +268,15 @@ def generate_maze(
 
 
 def _change(walk: _Walk, num_looks: int) -> _Walk:
-    """Let the present wall grow by one node or, when its looks are used up, begin another wall."""
+    """Grow the current wall by one node or, if it has no looks left, begin another wall."""
     key, key_island, key_looks, key_neighbor = jax.random.split(walk.key, 4)
     nodes = walk.maze.shape[0] // 2 + 1  # along one axis
     neighbors = walk.node + jnp.asarray(MOVES[:4])
     inside = jnp.all((neighbors >= 0) & (neighbors < nodes), axis=1)
     clipped = jnp.clip(neighbors, 0, nodes - 1)
     free = inside & (walk.maze[2 * clipped[:, 0], 2 * clipped[:, 1]] == 0)
-    # Looks until a free neighbor is found, each a uniform draw among those inside.
+    # The number of looks until a free neighbor is found; each look is a uniform draw from the neighbors
+    # inside.
     hit = free.sum() / inside.sum()
     miss = jnp.log1p(-jnp.minimum(hit, 1 - 1e-7))
     looks = 1 + jnp.floor(jnp.log(jax.random.uniform(key_looks, minval=1e-12)) / miss)
@@ -287,7 +288,7 @@ def _change(walk: _Walk, num_looks: int) -> _Walk:
     between = jnp.where(grows, walk.node + target, 2 * island)
     node = jnp.where(grows, target, island)
     islands_left = walk.islands_left - ~grows
-    # Once the last wall has grown, the cells below stay what they are.
+    # Once the last wall is complete, nothing changes any more.
     active = islands_left >= 0
     rows = jnp.stack([between[0], 2 * node[0]])
     columns = jnp.stack([between[1], 2 * node[1]])
@@ -302,7 +303,7 @@ def _change(walk: _Walk, num_looks: int) -> _Walk:
 
 
 def _clear_start(maze: Int[Array, "S S"]) -> Int[Array, "S S"]:
-    """Free the four rows at the bottom but for the two walls of the corridor that agents start in."""
+    """Clear the four rows at the bottom, except for the two walls of the corridor in which agents start."""
     side = maze.shape[0]
     corridor = jnp.array([side // 2 - 1, side // 2 + 1])
     maze = maze.at[side - 5 : side - 1, 1:-1].set(0)

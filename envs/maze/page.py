@@ -1,4 +1,4 @@
-"""What MazeRunner brings to HTML pages."""
+"""MazeRunner's part of HTML pages."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from envs.page import Page
 
 
 def maze_page(env: MazeRunner) -> Page:
-    """The rules, and mazes with visits and paths."""
+    """The rules of the world, and the drawing of mazes with visits and paths."""
     return Page(
         script=Path(__file__).with_name("page.js"),
         facts={

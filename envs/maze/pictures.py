@@ -1,7 +1,7 @@
 """Pictures of mazes: walls, visits, paths, prompts, and GIFs of episodes.
 
-Positions are (row, column). Markers and labels are drawn in units of cells, so they keep their place
-and proportion at every figure size.
+Positions are (row, column). Markers and labels are drawn in units of cells, so that they keep their places
+and proportions at every figure size.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ VISIT_COLORS = LinearSegmentedColormap.from_list(
     "visits", ["#EAE6F3", "#C3B7DC", "#9A86C2", "#704FA3", "#48237F", "#260B4D"]
 )
 
-BAR_GAP = 0.6  # cells between the maze and the bar of goals outside of it
-BAR_LANE, BAR_ROW = 1.7, 1.35  # size of a marker's place in that bar, in marker units
+BAR_GAP = 0.6  # distance in cells between the maze and the bar that shows goals outside of it
+BAR_LANE, BAR_ROW = 1.7, 1.35  # width and height of a marker's place in that bar, in marker units
 
 
 def maze_pictures(env: MazeRunner) -> Pictures:
@@ -75,7 +75,7 @@ def draw_prompts(
 def draw_visits(
     start: Cell, axes: Sequence[Axes], tasks: Sequence[Task], shown: Sequence[Shown]
 ) -> ScalarMappable:
-    """Each prompt on its maze, with the mean visits of the cells in its episodes."""
+    """Each prompt on its maze, with the mean number of visits to each cell in its episodes."""
     visits = [
         visit_counts(each.episode, task.maze, start)
         for task, each in zip(tasks, shown, strict=True)
@@ -96,7 +96,8 @@ def draw_known(
     shown: Sequence[Shown],
     reached: Sequence[np.ndarray],
 ) -> ScalarMappable:
-    """Each prompt on its maze, the way of its episode, and how often each cell was visited until then."""
+    """Each prompt on its maze, with the path of its episode and the number of earlier visits to each
+    cell."""
     counts = [reached_counts(goals, task.maze) for goals, task in zip(reached, tasks, strict=True)]
     norm = visit_norm(*counts)
     lanes = max(bar_lanes(len(tasks[0].maze), [each.goals]) for each in shown)
@@ -126,12 +127,12 @@ def write_video(start: Cell, path: Path, task: Task, shown: Sequence[Shown]) -> 
 
 
 class Placement(NamedTuple):
-    """Where the goals of one prompt lie."""
+    """The places of the goals of one prompt."""
 
     cells: np.ndarray
     """``[k, 2]`` integers, the nearest cells; meaningless for goals outside the maze."""
     outside: np.ndarray
-    """``[k]`` booleans: the goal lies in no cell of the maze."""
+    """``[k]`` booleans: whether the goal is outside of the maze."""
 
 
 class Panel(NamedTuple):
@@ -139,13 +140,13 @@ class Panel(NamedTuple):
 
     title: str
     walk: np.ndarray
-    """``[T + 1, 2]`` cells, the start first."""
+    """``[T + 1, 2]`` cells, beginning with the start."""
     prompt_goals: np.ndarray | None = None
-    """``[k, 2]`` in goal units."""
+    """``[k, 2]``: the goals of the prompt, in goal units."""
 
 
 class _Marker(NamedTuple):
-    """A labeled shape at a cell, or (``cell=None``) in the bar."""
+    """A labeled shape at a cell or (with ``cell=None``) in the bar."""
 
     label: str
     color: str
@@ -154,13 +155,13 @@ class _Marker(NamedTuple):
 
 
 def walk_of(episode: Episode, side: int, start: Cell) -> np.ndarray:
-    """The cells of one episode, ``[length + 1, 2]``: the start, then where each step led."""
+    """The cells of one episode, ``[length + 1, 2]``: the start, then the cell after each step."""
     goals = np.asarray(episode.trajectory.achieved_goals)[: int(episode.trajectory.length)]
     return np.concatenate([np.reshape(start, (1, 2)), np.rint(goals * side).astype(int)])
 
 
 def visit_counts(episodes: Episode, maze: np.ndarray, start: Cell) -> np.ndarray:
-    """Mean visits of each cell in one of a batch of episodes, the start included."""
+    """The mean number of visits to each cell per episode of a batch, including the start."""
     goals = np.asarray(episodes.trajectory.achieved_goals)
     happened = np.arange(goals.shape[1]) < np.asarray(episodes.trajectory.length)[:, None]
     counts = reached_counts(goals[happened], maze)
@@ -169,7 +170,7 @@ def visit_counts(episodes: Episode, maze: np.ndarray, start: Cell) -> np.ndarray
 
 
 def reached_counts(goals: np.ndarray, maze: np.ndarray) -> np.ndarray:
-    """How often each cell is among goals ``[n, 2]`` that were reached."""
+    """The number of times that each cell is among goals ``[n, 2]`` that were reached."""
     counts = np.zeros(maze.shape)
     np.add.at(counts, tuple(np.rint(np.asarray(goals) * len(maze)).astype(int).T), 1.0)
     return counts
@@ -179,24 +180,24 @@ def place_goals(goals: np.ndarray, side: int) -> Placement:
     """Cells of goals given in goal units (row / side, column / side)."""
     positions = np.asarray(goals, np.float64).reshape(-1, 2) * side
     finite = np.isfinite(positions)
-    # Clipping first keeps huge values from overflowing the integers.
+    # Values are clipped first, so that huge ones do not overflow integers.
     cells = np.rint(np.clip(np.where(finite, positions, -1.0), -1.0, side)).astype(int)
     return Placement(cells, ~np.all((cells >= 0) & (cells < side), axis=1))
 
 
 def visit_norm(*visits: np.ndarray) -> PowerNorm:
-    """A color scale that several pictures can share; it spreads the few-visits end."""
+    """A color scale that several pictures can share, with more contrast among low counts."""
     top = max((float(np.max(counts)) for counts in visits), default=0.0)
     return PowerNorm(gamma=0.5, vmin=0.0, vmax=top if top > 0 else 1.0)
 
 
 def visit_scale(norm: PowerNorm) -> ScalarMappable:
-    """What ``Figure.colorbar`` needs to explain the colors of visits."""
+    """The argument of ``Figure.colorbar`` for the colors of visits."""
     return ScalarMappable(norm, VISIT_COLORS)
 
 
 def bar_lanes(side: int, prompts: Iterable[np.ndarray]) -> int:
-    """How many lanes the bar needs for the goals of ``prompts`` that lie outside the maze."""
+    """The number of lanes that the bar needs for goals of ``prompts`` outside of the maze."""
     count = sum(int(place_goals(goals, side).outside.sum()) for goals in prompts)
     return -(-count // _markers_in_lane(side))
 
@@ -217,20 +218,20 @@ def draw_maze(
     norm: PowerNorm | None = None,
     lanes: int | None = None,
 ) -> None:
-    """Draw a maze with its start S, its task goal T and what happens in it.
+    """Draw a maze with its start S and its task goal T, and prompts, visits and paths in it.
 
     Args:
-      ax: where to draw; its ticks and frame are removed.
+      ax: the axes to draw on; their ticks and frame are removed.
       maze: ``[side, side]``, 1 is a wall.
-      start: cell of the start.
-      goal: cell of the task goal.
-      prompt_goals: ``[k, 2]`` goals of a prompt in goal units, numbered in their order, or several
-        prompts by color. A last goal at T is not repeated; goals outside the maze go to a bar at
-        the right.
-      visits: ``[side, side]`` how often each cell was visited; darker is more.
-      paths: ``[T, 2]`` cells of walks to draw as lines.
+      start: the cell of the start.
+      goal: the cell of the task goal.
+      prompt_goals: ``[k, 2]`` goals of a prompt in goal units, which are numbered in order, or several
+        prompts by color. A last goal at T is not drawn again; goals outside of the maze are drawn in a bar
+        on the right.
+      visits: ``[side, side]`` number of visits to each cell; darker is more.
+      paths: ``[T, 2]`` cells of walks, drawn as lines.
       norm: color scale of ``visits`` [their own range].
-      lanes: lanes of the bar [as many as needed], to align pictures that share a row.
+      lanes: number of lanes of the bar, to align pictures in a row [as many as needed].
     """
     maze = np.asarray(maze)
     side = len(maze)
@@ -253,7 +254,7 @@ def draw_maze(
 def maze_gif(
     path: Path, maze: np.ndarray, start: Cell, goal: Cell, panels: Sequence[Panel]
 ) -> None:
-    """Write a short GIF of episodes in one maze; those that end earlier stand still."""
+    """Write a short GIF of episodes in one maze; those that end earlier stop at their end."""
     side = len(maze)
     prompts = [panel.prompt_goals for panel in panels if panel.prompt_goals is not None]
     lanes = max((bar_lanes(side, [goals]) for goals in prompts), default=0)
@@ -284,7 +285,8 @@ def _by_color(prompts: np.ndarray | Mapping[str, np.ndarray] | None) -> Mapping[
 
 
 def _unit(side: int) -> float:
-    """Size of markers in cells: one cell and a bit, and more where cells are tiny."""
+    """The size of markers in cells: a little more than one cell, and larger in big mazes with small
+    cells."""
     return max(1.0, side / 19)
 
 
@@ -329,7 +331,7 @@ def _draw_markers(ax: Axes, side: int, markers: list[_Marker], lanes: int) -> No
     inside = [marker for marker in markers if marker.cell is not None]
     homes = np.array([marker.cell for marker in inside], float)
     heavy = np.array([marker.shape == "box" for marker in inside])
-    margin = 0.6 * unit - 0.5  # no marker is cut at the edge
+    margin = 0.6 * unit - 0.5  # so that no marker is cut off at the edge
     centers = spread_apart(homes, heavy, gap=unit, limits=(margin, side - 1 - margin))
     for marker, home, center in zip(inside, homes, centers, strict=True):
         if np.linalg.norm(center - home) > 0.5:

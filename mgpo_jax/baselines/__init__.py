@@ -1,1 +1,1 @@
-"""What the paper compares prompt optimization with, as adapters (Tables 1 and 8)."""
+"""The baselines of the paper (Tables 1 and 8) as adapters."""

@@ -1,12 +1,12 @@
 """The low level of PTGM: a Transformer that is commanded to reach one goal at a time (paper, appendix F.2).
 
-The paper calls it a slightly modified MGPO without a prompt, in which every observation has a goal from
-hindsight relabeling, and adds a goal prior p(g | h_t, o_t), fitted by maximum likelihood. Which goal is
-relabeled, and how far ahead, the paper does not say.
+The paper describes it as a slightly modified MGPO without a prompt, in which every observation has a goal
+from hindsight relabeling, and adds a goal prior p(g | h_t, o_t), fitted by maximum likelihood. It does not
+say which goal is used for relabeling, nor how far ahead.
 
-Here a commanded goal is one more token that reads the history up to o_t and gives pi(a_t | g, h_t, o_t). No
-other token reads it, so that the history never tells what was commanded before, and what has been cached
-stays valid under every command. The output at o_t itself gives the prior.
+Here the commanded goal is an additional token that attends to the history up to o_t, and whose output gives
+pi(a_t | g, h_t, o_t). No other token attends to it. The history therefore does not depend on earlier
+commands, and the key-value cache stays valid under every command. The output at o_t itself gives the prior.
 """
 
 from __future__ import annotations
@@ -38,22 +38,22 @@ Number = Annotated[float, Ge(-1e18), Le(1e18)]
 
 @dataclass(frozen=True)
 class CommandConfig(TransformerConfig):
-    """Sizes of the network. Those that the paper does not give are ours."""
+    """Config of the network. The paper does not give all of these settings; the others are ours."""
 
     __pydantic_config__ = STRICT
 
     commands: Annotated[tuple[tuple[Number, ...], ...], MaxLen(65_536)] = ()
-    """The goals that can be commanded, which the high level chooses among."""
+    """The goals that can be commanded; the high level chooses among them."""
     every_position: bool = False
     """Whether every step of an episode reaches a goal, as in mazes."""
     ahead: Count = 20
-    """Largest number of steps to a relabeled goal, where every step reaches one; elsewhere it is the next
-    goal that the demonstration reached."""
+    """Largest number of steps to a relabeled goal in worlds where every step reaches one; in other worlds
+    the relabeled goal is the next one that the demonstration reached."""
     arrived: Share = 0.05
-    """Share of the steps whose command is the goal that was reached last, so that an agent which arrives
-    before the next decision goes on as demonstrators do."""
+    """Fraction of the steps whose command is the goal reached last, so that an agent that reaches its goal
+    before the next decision continues as the demonstrators do."""
     skill_steps: Annotated[int, Ge(1), Le(10_000)] = 10
-    """Steps between two decisions of the high level [10]."""
+    """Number of steps between two decisions of the high level [10]."""
 
     @property
     def goals(self) -> Float[Array, "N G"]:
@@ -62,18 +62,18 @@ class CommandConfig(TransformerConfig):
 
 
 class Reading(NamedTuple):
-    """What the network says of a trajectory of T steps."""
+    """The network's outputs for a trajectory of T steps."""
 
     actions: Distribution
     """pi(a_t | g_t, h_t, o_t) under the commands."""
     prior: Float[Array, "T N"]
     """Logits of p(g | h_t, o_t)."""
     features: Float[Array, "T E"]
-    """The outputs at the observations, which know no command."""
+    """The outputs at the observations, which do not depend on commands."""
 
 
 class CommandedTransformer(GoalTransformer):
-    """pi(a_t | g_t, h_t, o_t) and p(g | h_t, o_t)."""
+    """The network of pi(a_t | g_t, h_t, o_t) and p(g | h_t, o_t)."""
 
     config: CommandConfig
 
@@ -94,7 +94,7 @@ class CommandedTransformer(GoalTransformer):
         """
         slots, stride, time = self.config.max_prompt_length, self.config.tokens_per_step, len(obs)
         times = self.embed_time[:time]
-        nothing = self._nothing()
+        nothing = self._empty_prompt()
         history = [self._prompt_tokens(nothing), self._step_tokens(obs, actions, times)]
         queries = self.embed_goal(commands) + times
         seen = self._seen(nothing, len(history[1]))
@@ -108,7 +108,7 @@ class CommandedTransformer(GoalTransformer):
 
     def begin(self, obs: Shaped[Array, "..."]) -> tuple[Float[Array, "E"], KVCache]:
         """Read the first observation; returns the features there and the cache."""
-        features, cache = self._first(self._nothing(), obs)
+        features, cache = self._first(self._empty_prompt(), obs)
         return features[-1], cache
 
     def proceed(
@@ -133,12 +133,12 @@ class CommandedTransformer(GoalTransformer):
         return logits
 
     def embedded(self, obs: Shaped[Array, "..."]) -> Float[Array, "E"]:
-        """An observation as the network takes it in, without its history and its time."""
+        """The embedding of an observation, without history and timestep."""
         token: Array = self.embed_obs(self.config.standardized(obs[None]))
         return token[0]
 
-    def _nothing(self) -> Prompt:
-        """The prompt of no goals."""
+    def _empty_prompt(self) -> Prompt:
+        """The empty prompt."""
         slots = self.config.max_prompt_length
         return Prompt(jnp.zeros((slots, self.config.goal_dim)), jnp.zeros(slots, bool))
 
@@ -146,19 +146,20 @@ class CommandedTransformer(GoalTransformer):
 def relabeled(
     key: PRNGKeyArray, goals: Goals | Trajectory, every_position: bool, ahead: int, arrived: float
 ) -> tuple[Int[Array, "T"], Float[Array, "T G"], Any]:
-    """Hindsight goals for all steps of a trajectory: for the prior, and for the action.
+    """Relabel all steps of a trajectory with goals that were reached in hindsight.
 
     Args:
       key: random key.
-      goals: what the trajectory reached.
-      every_position: whether every step reaches a goal. A step's goal is then that of a random number of
-        steps from 1 to ``ahead`` later, or the last one; else it is the next one that is reached.
-      ahead: as said.
-      arrived: share of the steps whose action is commanded by the goal that was reached last.
+      goals: the goals that the trajectory reached.
+      every_position: whether every step reaches a goal. If so, the goal of a step is the one reached 1 to
+        ``ahead`` steps later (uniformly drawn), at most that of the last step; otherwise it is the next one
+        that was reached.
+      ahead: the largest number of steps to a goal.
+      arrived: fraction of the steps that are commanded to the goal that was reached last instead.
 
     Returns:
-      ``(next, command, counts)``: the step that reaches the next goal, [T]; the goals commanded, [T, G];
-      and the steps t that have a next goal, bool [T].
+      ``(next, command, counts)``: the step that reaches the relabeled goal of each step, which the prior
+      predicts, int [T]; the commanded goals, [T, G]; and whether a step has a relabeled goal, bool [T].
     """
     num_steps = len(goals.goal_reached)
     time = jnp.arange(num_steps)
@@ -170,7 +171,7 @@ def relabeled(
         next_ = jnp.minimum(far, goals.length - 1)
         counts = real
     else:
-        # The smallest index of a step that reaches a goal, from each step on.
+        # For each step, the index of the first step from there on that reaches a goal.
         next_ = jax.lax.cummin(jnp.where(reached, time, num_steps), reverse=True)
         counts = real & (next_ < num_steps)
         next_ = jnp.minimum(next_, num_steps - 1)
@@ -181,8 +182,8 @@ def relabeled(
 
 
 def nearest_command(goals: Float[Array, "*T G"], commands: Float[Array, "N G"]) -> Int[Array, "*T"]:
-    """The index of the command that each goal is nearest to."""
-    # Squared distances without the goals' own squares, which are the same for all commands.
+    """The index of the command that is nearest to each goal."""
+    # Squared distances up to the squared norm of the goal, which is the same for all commands.
     return jnp.argmin(jnp.sum(commands**2, axis=-1) - 2 * goals @ commands.T, axis=-1)
 
 
@@ -196,7 +197,7 @@ def commanded_loss(
 ) -> tuple[Float[Array, ""], Stats]:
     """-sum_t log pi(a_t | g_t, h_t, o_t) + log p(g_t | h_t, o_t) of one trajectory.
 
-    The prior's goal is the command that is nearest to the relabeled one.
+    The prior is trained on the command that is nearest to the relabeled goal.
     """
     key_goal, key_dropout, key_noise = jax.random.split(key, 3)
     if obs_noise and not deterministic:
@@ -220,21 +221,21 @@ def commanded_loss(
 
 
 class View(NamedTuple):
-    """What a high level can decide by."""
+    """The inputs on which a high level can base its decisions."""
 
     obs: Float[Array, "*batch E"]
     """The embedded observation."""
     features: Float[Array, "*batch E"]
-    """The network's output at the observation, which knows the history."""
+    """The network's output at the observation, which depends on the history, too."""
 
 
 def low_level(config: CommandConfig, params: Any, judged: Judgement) -> LowLevel:
-    """The network as the low level; a decision is the index of a command.
+    """The network as the low level of a hierarchy; a decision is the index of a command.
 
     Args:
-      config: the network.
-      params: its weights.
-      judged: how actions are drawn: as the world judges policies, also in episodes that learn.
+      config: the network's config.
+      params: its parameters.
+      judged: how actions are chosen. Training episodes use the same way as judging ones.
     """
     network: Any = CommandedTransformer(config)
     temperature = jnp.float32(judged.temperature) if judged.tempered else None
@@ -266,13 +267,13 @@ def low_level(config: CommandConfig, params: Any, judged: Judgement) -> LowLevel
 
 
 def log_prior(config: CommandConfig, params: Any, view: View) -> Float[Array, "N"]:
-    """log p(g | h_t, o_t) of all commands."""
+    """log p(g | h_t, o_t) of all N commands."""
     network: Any = CommandedTransformer(config)
     return jax.nn.log_softmax(network.apply(params, view.features, method="prior_logits"))
 
 
 def prior_agent(config: CommandConfig, params: Any, judged: Judgement) -> Agent:
-    """Follows goals drawn from the prior, which knows nothing of the task."""
+    """The agent that follows goals drawn from the prior, which does not depend on the task."""
 
     def decide(key: PRNGKeyArray, view: View, state: Any) -> tuple[Array, tuple]:
         del state
@@ -284,34 +285,34 @@ def prior_agent(config: CommandConfig, params: Any, judged: Judgement) -> Agent:
 
 
 def complete(config: CommandConfig, env: Environment, dataset: Any) -> CommandConfig:
-    """The config with the world's goals as commands."""
+    """The config completed with the world's goals as commands."""
     del dataset
     goals = np.asarray(env.goal_set, np.float32)
     return replace(
         config,
         commands=tuple(map(tuple, goals.tolist())),
         every_position=env.spec.truncate_in_hindsight,
-        max_prompt_length=1,  # which stays empty
+        max_prompt_length=1,  # the prompt stays empty
         prompt_order=False,
     )
 
 
 def fault(config: CommandConfig) -> str | None:
-    """What of a config does not fit together."""
+    """What is wrong with a config; None if nothing is."""
     if not config.commands or {len(goal) for goal in config.commands} != {config.goal_dim}:
         return f"commands must hold goals of {config.goal_dim} numbers"
     return None
 
 
 def init(key: PRNGKeyArray, config: CommandConfig) -> Any:
-    """Random weights."""
+    """Randomly initialized parameters."""
     goals = jnp.zeros((1, config.goal_dim))
     network = CommandedTransformer(config)
     return network.init(key, goals, *config.blank_episode(), method="read")
 
 
 def facts(config: CommandConfig) -> dict[str, str]:
-    """What a card says of the network."""
+    """The facts about the network for a model card."""
     ahead = f"1 to {config.ahead} steps ahead" if config.every_position else "the next one reached"
     return {
         "network": transformer_told(config),

@@ -1,9 +1,10 @@
-"""BC-finetune: the pre-trained network learns from the returns of the prompt (g^M) (paper, Tables 1, 7, 8).
+"""BC-finetune: fine-tunes the pre-trained network by policy gradients (paper, Tables 1, 7, 8).
 
-The prompt stays (g^M). A round plays some episodes with sampled actions and one set of weights, and then
-updates the weights by REINFORCE or PPO. Table 7 gives the discount, the learning rate, its "decay" and the
-episodes of a round; everything else is ours, and no code of the authors shows it. Actions are sampled from
-the pre-trained head's own distribution, where the authors sample the kitchen's with a fixed spread.
+The prompt is always (g^M). A round runs some episodes with sampled actions, and then updates the network's
+weights by REINFORCE or PPO. Table 7 gives the discount, the learning rate, its "decay" and the number of
+episodes in a round; everything else is ours, since the authors published no code for it. Actions are
+sampled from the distribution of the pre-trained head; in the kitchen the authors sample with a fixed
+standard deviation.
 
 Everything is for one task, as in every adapter.
 """
@@ -45,25 +46,25 @@ class ValueHead(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """What an update trains."""
+    """The trained parameters."""
 
     policy: Any
-    """The part of the network that is trained; see ``subsets``."""
+    """The trained part of the network; see ``subsets``."""
     value: ValueHead
 
 
 class Learner(NamedTuple):
-    """State of the finetuning on one task."""
+    """The state of fine-tuning on one task."""
 
     task_goal: Float[Array, "*batch G"]
     weights: Weights
     opt_state: Any
     rounds: Int[Array, "*batch"]
-    """Rounds played so far."""
+    """Number of rounds so far."""
 
 
 class Batch(NamedTuple):
-    """The K episodes of a round, with what stays fixed while they are learned from."""
+    """The K episodes of a round, with quantities that stay fixed during its gradient steps."""
 
     prompt: Prompt
     obs: Shaped[Array, "K T ..."]
@@ -71,15 +72,15 @@ class Batch(NamedTuple):
     rewards: Float[Array, "K T"]
     real: Bool[Array, "K T"]
     before: Distribution
-    """The action distributions that the episodes were played with, [K, T]."""
+    """The action distributions of the policy that ran the episodes, [K, T]."""
     pretrained: Distribution
-    """Those of the pre-trained network at the same observations."""
+    """The action distributions of the pre-trained network at the same observations, [K, T]."""
     values: Float[Array, "K T"]
-    """Values before the update."""
+    """Value estimates before the update."""
 
 
 class Pass(NamedTuple):
-    """What the network says of the episodes of a round."""
+    """The network's outputs for the episodes of a round."""
 
     actions: Distribution
     values: Float[Array, "K T"]
@@ -89,15 +90,16 @@ Loss = Callable[[Pass, Batch], Float[Array, ""]]
 
 
 class Round(NamedTuple):
-    """How an algorithm learns from a round."""
+    """A policy-gradient algorithm: its loss and how it learns from a round."""
 
     loss: Callable[[Batch], Loss]
-    """``(batch) -> ((pass, batch) -> loss)``: what it computes once before the first gradient step."""
+    """``(batch) -> ((pass, batch) -> loss)``: makes the loss of a round. What does not depend on the
+    current weights, such as advantages, is computed once, before the first gradient step."""
     epochs: int = 1
     share_trunk: bool = False
-    """Whether the error of the values trains the network below the value head."""
+    """Whether the value loss also trains the network below the value head."""
     value_rounds: Int[Array, ""] | int = 0
-    """Rounds at the start in which the policy stays as it is."""
+    """Number of rounds at the start in which only the value head is trained."""
     value_rate: Float[Array, ""] | float = 0.0
     max_kl: Float[Array, ""] | float | None = None
 
@@ -108,7 +110,7 @@ def real_mean(values: Float[Array, "K T"], real: Bool[Array, "K T"]) -> Float[Ar
 
 
 def optimizer(hyper: FinetuneHyper, value_rate: Any) -> optax.GradientTransformation:
-    """AdamW with clipped gradients, for the policy and the value head apart."""
+    """AdamW with gradient clipping, separately for the policy and for the value head."""
 
     def adamw(rate: Any) -> optax.GradientTransformation:
         def schedule(count: Array) -> Array:
@@ -124,12 +126,12 @@ def optimizer(hyper: FinetuneHyper, value_rate: Any) -> optax.GradientTransforma
 
 
 class Finetuner:
-    """A policy gradient on one task; all methods are pure.
+    """Fine-tuning by policy gradients on one task; all methods are pure.
 
     Args:
-      setting: what is known beforehand.
-      params: the pre-trained weights.
-      hyper: what both algorithms share.
+      setting: the setting (``methods.Setting``).
+      params: the pre-trained parameters.
+      hyper: the hyper-parameters that both algorithms share.
       how: the algorithm.
     """
 
@@ -140,7 +142,7 @@ class Finetuner:
         self.optimize = optimizer(hyper, how.value_rate)
 
     def adapter(self) -> Adapter:
-        """The same as an adapter."""
+        """The methods as an adapter."""
         return Adapter(
             init=self.init,
             ask=self.ask,
@@ -157,7 +159,7 @@ class Finetuner:
         return Learner(task_goal, weights, self.optimize.init(weights), jnp.zeros((), jnp.int32))
 
     def prompt_of(self, state: Learner) -> Prompt:
-        """The prompt (g^M), which stays."""
+        """The prompt (g^M), which never changes."""
         return single_goal(state.task_goal, self.setting.network.max_prompt_length)
 
     def ask(self, key: PRNGKeyArray, state: Learner) -> tuple[Query, Learner]:
@@ -170,13 +172,13 @@ class Finetuner:
         return prompted(transformer_policy(self.setting.network, params), query)
 
     def tell(self, key: PRNGKeyArray, state: Learner, query: Query, episodes: Episode) -> Learner:
-        """Learn from a round."""
+        """Update the weights with the episodes of a round."""
         del key
         batch = self._batch(state, query, episodes)
         loss_of = self.how.loss(batch)
 
         def loss(weights: Weights) -> tuple[Array, Array]:
-            now = self._passed(weights, batch)
+            now = self._forward(weights, batch)
             away = real_mean(now.actions.kl(batch.pretrained), batch.real)
             moved = real_mean(batch.before.kl(now.actions), batch.real)
             return loss_of(now, batch) + self.hyper.kl * away, moved
@@ -202,7 +204,7 @@ class Finetuner:
         trajectory = episodes.trajectory
         obs, actions = trajectory.obs, trajectory.actions
         merged = self.part.merge(state.weights.policy)
-        before, features = self._look(merged, query.prompt, obs, actions)
+        before, features = self._outputs(merged, query.prompt, obs, actions)
         return Batch(
             prompt=query.prompt,
             obs=obs,
@@ -210,11 +212,11 @@ class Finetuner:
             rewards=episodes.rewards,
             real=jnp.arange(actions.shape[1]) < trajectory.length[:, None],
             before=before,
-            pretrained=self._look(self.params, query.prompt, obs, actions)[0],
+            pretrained=self._outputs(self.params, query.prompt, obs, actions)[0],
             values=state.weights.value(features),
         )
 
-    def _look(
+    def _outputs(
         self, params: Any, prompt: Prompt, obs: Array, actions: Array
     ) -> tuple[Distribution, Array]:
         """Action distributions and features at all steps of K episodes."""
@@ -226,9 +228,9 @@ class Finetuner:
         seen: tuple[Distribution, Array] = jax.vmap(one)(obs, actions)
         return seen
 
-    def _passed(self, weights: Weights, batch: Batch) -> Pass:
+    def _forward(self, weights: Weights, batch: Batch) -> Pass:
         merged = self.part.merge(weights.policy)
-        actions, features = self._look(merged, batch.prompt, batch.obs, batch.actions)
+        actions, features = self._outputs(merged, batch.prompt, batch.obs, batch.actions)
         if not self.how.share_trunk:
             features = jax.lax.stop_gradient(features)
         return Pass(actions, weights.value(features))
@@ -289,7 +291,7 @@ def make_ppo(setting: Setting, params: Any, hyper: PpoHyper) -> Adapter:
 
 
 def check_finetune(setting: Setting, hyper: FinetuneHyper) -> None:
-    """Raise ``UsageError`` for a policy whose exploring actions are no samples of its distribution."""
+    """Raise ``UsageError`` if the policy's exploratory actions are not samples of its distribution."""
     del hyper
     if setting.network.head == "mixture":
         raise UsageError(

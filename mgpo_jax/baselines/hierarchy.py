@@ -1,7 +1,7 @@
-"""Hierarchies of two levels: every k steps the high level decides, and the low level acts on the decision.
+"""Two-level hierarchies: every k steps the high level makes a decision, on which the low level acts.
 
-SPiRL and PTGM are both of this form. Decisions fall on the steps 0, k, 2k, .. of an episode, for all
-episodes of a batch, which share one clock.
+SPiRL and PTGM are both of this form. Decisions are made at the steps 0, k, 2k, .. of an episode, at the
+same time for all episodes of a batch, which step together.
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ class Mlp(nn.Module):
 
 
 class LowLevel(NamedTuple):
-    """Who acts between decisions; all functions are pure and for one episode."""
+    """The low level, which acts between decisions; all functions are pure and for one episode."""
 
     begin: Callable[[Array], tuple[Any, Any]]
-    """``(obs) -> (view, carry)`` at the first observation. A view is what a high level decides by."""
+    """``(obs) -> (view, carry)`` at the first observation. The view is the input of the high level."""
     proceed: Callable[[Any, Array, Array], tuple[Any, Any]]
     """``(carry, action, obs) -> (view, carry)`` after every step."""
     command: Callable[[Any, Any], Any]
-    """``(carry, decision) -> orders``: what a decision says for all of its steps."""
+    """``(carry, decision) -> orders``: the decision in the form that ``act`` needs for all of its steps."""
     act: Callable[[PRNGKeyArray, Any, Any, Int[Array, ""]], Array]
-    """``(key, carry, orders, index) -> action`` in the ``index``-th step after the decision."""
+    """``(key, carry, orders, index) -> action``, ``index`` steps after the decision."""
     grow: Callable[[Any, int], Any] = keeps_its_size
     """``(carry, num_steps) -> carry`` with room for that many more steps."""
 
 
 Decide = Callable[[PRNGKeyArray, Any, State], tuple[Any, Any]]
-"""``(key, view, state) -> (decision, kept)``: ``kept`` is what a learner wants to know of it later. Only
-references, which learn nothing, may look at the state of the world."""
+"""``(key, view, state) -> (decision, kept)``: ``kept`` is what a learner needs to remember about the
+decision. Only reference agents, which do not learn, may look at the state of the world."""
 
 
 class _Memory(NamedTuple):
@@ -59,7 +59,7 @@ class _Memory(NamedTuple):
     action: Array
     orders: Any
     kept: Any
-    """What was kept of the decisions so far, [M, ..]."""
+    """The values ``kept`` of the decisions so far, [M, ..]."""
 
 
 def num_decisions(horizon: int, skill_steps: int) -> int:
@@ -68,18 +68,18 @@ def num_decisions(horizon: int, skill_steps: int) -> int:
 
 
 def hierarchical(low: LowLevel, decide: Decide, skill_steps: int, horizon: int) -> Agent:
-    """The agent of two levels.
+    """The agent of a two-level hierarchy.
 
     Args:
-      low: who acts.
-      decide: who decides.
+      low: the low level.
+      decide: the high level.
       skill_steps: k, the number of steps between two decisions.
       horizon: the largest number of steps of an episode.
     """
     num = num_decisions(horizon, skill_steps)
 
     def decided(key: PRNGKeyArray, view: Any, carry: Any, state: State) -> tuple[Any, Any]:
-        """The orders of a new decision, and what is kept of it."""
+        """Make a new decision; returns its orders and what is kept of it."""
         decision, kept = decide(key, view, state)
         return low.command(carry, decision), kept
 
@@ -106,7 +106,7 @@ def hierarchical(low: LowLevel, decide: Decide, skill_steps: int, horizon: int) 
             put = lambda rows, new: jax.lax.dynamic_update_index_in_dim(rows, new, at, 0)  # noqa: E731
             return orders, jax.tree.map(put, memory.kept, row)
 
-        # The clock is one number for a whole batch, so that only one branch is computed.
+        # All episodes of a batch share the step counter, so only one branch is computed.
         orders, kept = jax.lax.cond(index == 0, anew, lambda: (memory.orders, memory.kept))
         action = low.act(key_act, carry, orders, index)
         after = _Memory(memory.time + 1, carry, action, orders, kept)
@@ -115,27 +115,27 @@ def hierarchical(low: LowLevel, decide: Decide, skill_steps: int, horizon: int) 
     def grow(memory: _Memory, num_steps: int) -> _Memory:
         return memory._replace(carry=low.grow(memory.carry, num_steps))
 
-    # A low level that needs no more room lets the whole episode be one loop.
+    # If the low level's memory does not grow, the whole episode can be one loop.
     fixed = low.grow is keeps_its_size
     growing = keeps_its_size if fixed else grow
     return Agent(begin, proceed, growing, decisions=lambda memory: memory.kept)
 
 
 class Transitions(NamedTuple):
-    """Decisions in the order in which they were made, rows [M, ..]; each leads to the next row's."""
+    """The decisions of episodes in order, rows [M, ..]; the successor of a decision is the next row."""
 
     kept: Any
-    """What was kept of each."""
+    """The values ``kept`` of each decision."""
     reward: Float[Array, "*M"]
     """Plain sum of the rewards of the decision's steps."""
     done: Bool[Array, "*M"]
-    """Whether the episode ended, or was cut at the horizon, before another decision."""
+    """Whether the episode ended, or was cut at the horizon, before the next decision."""
     valid: Bool[Array, "*M"]
-    """Whether the decision was made in the episode; those after its end mean nothing."""
+    """Whether the decision was made before the end of the episode; other rows are meaningless."""
 
 
 def transitions(episode: Episode, skill_steps: int) -> Transitions:
-    """The decisions of one episode of a hierarchical agent."""
+    """The decisions of one episode of a hierarchical agent, as transitions."""
     horizon = len(episode.rewards)
     num = num_decisions(horizon, skill_steps)
     padded = jnp.pad(episode.rewards, (0, num * skill_steps - horizon))
@@ -150,19 +150,19 @@ def transitions(episode: Episode, skill_steps: int) -> Transitions:
 
 
 class Replay(NamedTuple):
-    """All transitions of an adaptation so far: the first ``size`` rows."""
+    """A replay buffer of all transitions of an adaptation so far, in its first ``size`` rows."""
 
     rows: Transitions
     size: Int[Array, "*batch"]
 
 
 def empty_replay(kept: Any, num_decisions: int, num_episodes: int) -> Replay:
-    """A replay without rows, with room for all decisions of a budget.
+    """An empty replay buffer with room for all decisions of a budget.
 
     Args:
-      kept: zeros of the shapes of what is kept of one decision.
+      kept: zeros with the shapes of what is kept of one decision.
       num_decisions: the largest number of decisions in an episode.
-      num_episodes: the budget.
+      num_episodes: the budget, in episodes.
     """
     capacity = num_decisions * num_episodes
     numbers, flags = jnp.zeros(capacity), jnp.zeros(capacity, bool)
@@ -171,7 +171,7 @@ def empty_replay(kept: Any, num_decisions: int, num_episodes: int) -> Replay:
 
 
 def remember(replay: Replay, new: Transitions) -> Replay:
-    """The replay with the valid ones of an episode's transitions. It has to have room for them."""
+    """Append the valid transitions of an episode. The buffer must have room for them."""
     capacity = len(replay.rows.valid)
     place = jnp.where(new.valid, replay.size + jnp.cumsum(new.valid) - 1, capacity)
     rows = jax.tree.map(lambda rows, more: rows.at[place].set(more, mode="drop"), replay.rows, new)
@@ -179,10 +179,9 @@ def remember(replay: Replay, new: Transitions) -> Replay:
 
 
 def draw(key: PRNGKeyArray, replay: Replay, num: int) -> tuple[Transitions, Transitions]:
-    """``num`` transitions, drawn uniformly and with replacement, and the ones that follow them.
+    """Draw ``num`` transitions uniformly with replacement; returns them and their successors.
 
-    What follows a transition that is ``done`` is of another episode or nothing. The replay must not be
-    empty.
+    The successor of a transition that is ``done`` is meaningless. The buffer must not be empty.
     """
     index = jax.random.randint(key, (num,), 0, replay.size)
     after = jnp.minimum(index + 1, len(replay.rows.valid) - 1)
@@ -193,7 +192,7 @@ def draw(key: PRNGKeyArray, replay: Replay, num: int) -> tuple[Transitions, Tran
 
 
 def reference(agent: Agent, choice: Any) -> Adapter:
-    """An agent that learns nothing, as an adapter whose choice is always the same."""
+    """Wrap an agent that does not learn in an adapter, whose choice is always the same."""
     return Adapter(
         init=lambda key, task_goal: (),
         ask=lambda key, state: (choice, state),

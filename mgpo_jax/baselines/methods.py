@@ -1,4 +1,4 @@
-"""The baselines by name, with their hyper-parameters. Nothing here imports jax."""
+"""The records of the baselines and their hyper-parameters. Nothing here imports jax."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ Share = Annotated[float, Ge(0), Le(1)]
 
 @dataclass(frozen=True)
 class FinetuneHyper:
-    """Hyper-parameters of both policy gradients. The defaults are Table 7 where it says anything."""
+    """Hyper-parameters of both policy gradients. The defaults are those of Table 7, as far as it gives
+    them."""
 
     tune: Literal["all", "head", "lora"] = static("all")
-    """What is trained: the whole network as in the paper, its last layers alone (``head``: the last norm
-    and the layer that gives the distribution), or matrices of low rank beside those of the blocks
-    (``lora``)."""
+    """The trained weights: of the whole network as in the paper (``all``), of its last norm and its action
+    head alone (``head``), or of low-rank matrices added to those of the blocks (``lora``)."""
     rank: Annotated[int, Ge(1), Le(128)] = static(4)
-    """Rank of those matrices."""
+    """Rank of the matrices of ``lora``."""
     round_episodes: Annotated[int, Ge(1), Le(1_000)] = static(5)
-    """Episodes that one set of weights plays before the next update [5]."""
+    """Number of episodes between two updates of the weights [5]."""
     learning_rate: Rate = 1e-4
-    """Of AdamW [1e-4]."""
+    """Learning rate of AdamW [1e-4]."""
     weight_decay: Rate = 1e-4
-    """Of AdamW, what Table 7 calls learning rate decay [1e-4]."""
+    """Weight decay of AdamW, which Table 7 calls learning rate decay [1e-4]."""
     clip_norm: Positive = 0.25
-    """Largest norm of a gradient (the paper does not say; the authors pre-train with 0.25)."""
+    """Largest global norm of a gradient (the paper does not say; the authors pre-train with 0.25)."""
     warmup_rounds: Annotated[int, Ge(0), Le(10_000)] = 0
-    """Rounds over which the learning rate rises to its value."""
+    """Number of rounds over which the learning rate rises to its value."""
     discount: Share = 0.98
-    """Discount factor of a step [0.98]."""
+    """Discount factor per step [0.98]."""
     kl: NotNegative = 0.0
     """Weight of the divergence KL(pi, pi_0) from the pre-trained policy in the loss."""
 
@@ -45,7 +45,7 @@ class ReinforceHyper(FinetuneHyper):
     """Hyper-parameters of REINFORCE. The paper does not say which baseline it subtracts, if any."""
 
     baseline: bool = static(False)
-    """Whether the mean return-to-go of the round's episodes at the same step is subtracted."""
+    """Whether to subtract as a baseline the mean return-to-go at the same step of the round's episodes."""
 
 
 @dataclass(frozen=True)
@@ -62,22 +62,22 @@ class PpoHyper(FinetuneHyper):
     """Hyper-parameters of PPO. Beyond Table 7 the paper gives none; the defaults are customary values."""
 
     clip: Positive = 0.2
-    """How far the ratio of probabilities counts from 1."""
+    """Largest deviation from 1 of a probability ratio, which is clipped there."""
     epochs: Annotated[int, Ge(1), Le(1_000)] = static(4)
-    """Gradient steps on the episodes of a round."""
+    """Number of gradient steps on the episodes of a round."""
     gae_lambda: Share = 0.95
     """Lambda of generalized advantage estimation."""
     value_weight: NotNegative = 0.5
-    """Weight of the squared error of the values."""
+    """Weight of the value loss, the squared error of the values."""
     value_rate: Rate = 1e-4
     """Learning rate of the value head."""
     share_trunk: bool = static(True)
-    """Whether the error of the values also trains the network below the value head."""
+    """Whether the value loss also trains the network below the value head."""
     value_rounds: Annotated[int, Ge(0), Le(10_000)] = 0
-    """Rounds at the start in which the value head alone is trained."""
+    """Number of rounds at the start in which only the value head is trained."""
     max_kl: Positive | None = None
-    """A round's remaining epochs are left out once the policy has moved farther than this (default:
-    none are)."""
+    """Divergence of the policy, in nats, beyond which the remaining epochs of a round are skipped (default:
+    no limit)."""
 
 
 @dataclass(frozen=True)
@@ -97,27 +97,27 @@ class PtgmHyper:
     """Hyper-parameters of PTGM's high level. Values in brackets are those of Table 10."""
 
     learning_rate: Rate = 1e-3
-    """Of Adam [1e-3]."""
+    """Learning rate of Adam [1e-3]."""
     batch_size: Annotated[int, Ge(1), Le(65_536)] = static(64)
-    """Transitions in an update [64]."""
+    """Number of transitions in an update [64]."""
     discount: Share = 0.95
-    """Discount factor of a decision [0.95]."""
+    """Discount factor per decision [0.95]."""
     epsilon: Share = 0.1
-    """How often the high level takes a random goal [0.1]."""
+    """Probability with which the high level chooses a random goal [0.1]."""
     kl: NotNegative = 0.5
     """Weight of the divergence from the goal prior in the reward of a decision [0.5]."""
     target_interval: Annotated[int, Ge(1), Le(1_000_000)] = 10
-    """Updates after which the target network is replaced [10]."""
+    """Number of updates between two replacements of the target network [10]."""
     sees_goal: bool = static(False)
     """Whether the high level sees the task goal g^M; the paper does not say."""
     reads: Literal["observation", "history"] = static("observation")
-    """What it sees of the episode: the embedded observation, or the low level's output at it, which knows
-    the history."""
+    """Input of the high level: the embedded observation, or the low level's output at it, which depends on
+    the history, too."""
 
 
 @dataclass(frozen=True)
 class PtgmGoalHyper(PtgmHyper):
-    """PTGM whose high level sees the task goal."""
+    """Hyper-parameters of PTGM whose high level sees the task goal."""
 
     sees_goal: bool = static(True)
 
@@ -127,20 +127,21 @@ class SpirlHyper:
     """Hyper-parameters of SPiRL's high level. Values in brackets are those of Table 9."""
 
     learning_rate: Rate = 1e-3
-    """Of Adam, for actor, critics and alpha [1e-3]."""
+    """Learning rate of Adam for actor, critics and alpha [1e-3]."""
     batch_size: Annotated[int, Ge(1), Le(65_536)] = static(256)
-    """Transitions in an update [256]."""
+    """Number of transitions in an update [256]."""
     discount: Share = 0.95
-    """Discount factor of a decision [0.95]."""
+    """Discount factor per decision [0.95]."""
     target_interval: Annotated[int, Ge(1), Le(1_000_000)] = 10
-    """Updates after which the target critics are replaced [10]."""
+    """Number of updates between two replacements of the target critics [10]."""
     target_divergence: NotNegative = 1.0
-    """Nats that the policy's divergence from the prior is to settle at (1 in mazes and 5 in the kitchen in
-    SPiRL's code; the paper does not say)."""
+    """Target of the policy's divergence from the prior, in nats (SPiRL's code: 1 in mazes and 5 in the
+    kitchen; the paper does not say)."""
     alpha: Positive = 1.0
-    """Weight of the divergence at the start; it is learned."""
+    """Initial weight of the divergence, which is then learned."""
     warmup_episodes: Annotated[int, Ge(0), Le(100_000)] = 10
-    """Episodes before the first update. They count, and the prior plays them."""
+    """Number of episodes before the first update, in which the prior acts; they count against the
+    budget."""
 
 
 _HERE = "mgpo_jax.baselines.finetune"

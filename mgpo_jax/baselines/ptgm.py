@@ -1,16 +1,16 @@
 """PTGM as the paper describes it: DQN chooses goals for a pre-trained low level (appendix F.2, Table 10).
 
-Every k steps the high level chooses among the world's goals, and the low level (``commanded``) goes for the
-chosen one. The high level is a multilayer perceptron that is trained by deep Q-learning on one task, with
-epsilon-greedy choices and a reward for staying near the goal prior: r' = R - w KL(pi, p), where R is the
-plain sum of the k rewards and pi the epsilon-greedy policy that chose. The PTGM of its own paper has
-clusters of observations for goals and is trained by PPO or SAC; that is another method.
+Every k steps the high level chooses one of the world's goals, and the low level (``commanded``) tries to
+reach it. The high level is a multilayer perceptron that is trained by deep Q-learning on one task, with
+epsilon-greedy choices and a penalty for departing from the goal prior: r' = R - w KL(pi, p), where R is the
+undiscounted sum of the k rewards and pi the epsilon-greedy policy that chose. The PTGM of its own paper is
+a different method: its goals are clusters of observations, and it is trained by PPO or SAC.
 
-The paper does not say what the high level sees, how often it is updated, how many transitions it waits for,
-nor how it is judged. Here it sees the embedded observation, in one variant also the task goal g^M; it is
-updated once for every decision, from the first moment that a batch can be drawn; and it is judged by its
-best goals, without exploring. A decision that the end of an episode cuts short does not bootstrap, whether
-the goal was reached or the time was up.
+The paper does not say what the high level sees, how often it is updated, how many transitions are collected
+first, nor how it is judged. Here it sees the embedded observation, and in one variant also the task goal
+g^M. It is updated once for every decision, as soon as there are enough transitions for a batch, and it is
+judged greedily, without exploration. A decision that is cut short by the end of an episode does not
+bootstrap, whether the task was solved or the horizon was reached.
 """
 
 from __future__ import annotations
@@ -52,24 +52,24 @@ from mgpo_jax.trees import choose
 
 
 class Choice(NamedTuple):
-    """How the high level is to choose goals in an episode."""
+    """How the high level chooses goals in an episode."""
 
     epsilon: Float[Array, "*batch"]
-    """How often it takes a random one."""
+    """Probability of a random goal."""
 
 
 class Kept(NamedTuple):
-    """What is kept of a decision."""
+    """The data of a decision that are kept for training."""
 
     seen: Float[Array, "*batch I"]
-    """What the high level saw."""
+    """The input of the high level."""
     goal: Int[Array, "*batch"]
     divergence: Float[Array, "*batch"]
-    """KL(pi, p) of the policy that chose and the prior, in nats."""
+    """KL(pi, p) between the epsilon-greedy policy and the prior, in nats."""
 
 
 class Learner(NamedTuple):
-    """State of the high level on one task."""
+    """The state of the high level on one task."""
 
     task_goal: Float[Array, "*batch G"]
     params: Any
@@ -82,7 +82,7 @@ class Learner(NamedTuple):
 def greedy_divergence(
     epsilon: Float[Array, ""], best: Int[Array, ""], log_p: Float[Array, "N"]
 ) -> Float[Array, ""]:
-    """KL(pi, p) for pi that takes ``best`` but with probability epsilon any of the N goals."""
+    """KL(pi, p) for the epsilon-greedy policy pi over N goals whose greedy choice is ``best``."""
     num = len(log_p)
     pi = jnp.full(num, epsilon / num).at[best].add(1 - epsilon)
     return jnp.sum(jnp.where(pi > 0, pi * (jnp.log(jnp.maximum(pi, 1e-30)) - log_p), 0.0))
@@ -94,7 +94,7 @@ def targets(
     next_values: Float[Array, "B N"],
     discount: float | Float[Array, ""],
 ) -> Float[Array, "B"]:
-    """R + discount * max Q(next), without the second term where ``done``."""
+    """The targets of Q-learning: R + discount * max Q(next), without the second term if ``done``."""
     return reward + jnp.where(done, 0.0, discount * next_values.max(axis=-1))
 
 
@@ -102,9 +102,9 @@ class Ptgm:
     """PTGM on one task; all methods are pure.
 
     Args:
-      setting: what is known beforehand.
-      params: weights of the low level.
-      hyper: how the high level learns.
+      setting: the setting (``methods.Setting``).
+      params: the parameters of the low level.
+      hyper: the hyper-parameters of the high level.
     """
 
     def __init__(self, setting: Setting, params: Any, hyper: PtgmHyper) -> None:
@@ -158,12 +158,12 @@ class Ptgm:
         return hierarchical(self.low, decide, self.config.skill_steps, self.config.horizon)
 
     def _seen(self, view: View, task_goal: Array) -> Float[Array, "I"]:
-        """What the high level sees."""
+        """The input of the high level."""
         read = view.features if self.hyper.reads == "history" else view.obs
         return jnp.concatenate([read, task_goal]) if self.hyper.sees_goal else read
 
     def tell(self, key: PRNGKeyArray, state: Learner, choice: Choice, episodes: Episode) -> Learner:
-        """Remember an episode, and update once for every decision in it."""
+        """Add an episode to the replay buffer, and update once for every decision in it."""
         del choice
         episode = jax.tree.map(lambda leaf: leaf[0], episodes)
         new = transitions(episode, self.config.skill_steps)
@@ -175,11 +175,11 @@ class Ptgm:
         return jax.lax.fori_loop(0, num, lambda i, state: self._update(keys[i], state), state)
 
     def _update(self, key: PRNGKeyArray, state: Learner) -> Learner:
-        """One gradient step on a batch of the replay."""
+        """Take one gradient step on a batch from the replay buffer."""
         return self.improved(state, *draw(key, state.replay, self.hyper.batch_size))
 
     def improved(self, state: Learner, now: Transitions, after: Transitions) -> Learner:
-        """One gradient step on transitions and those that follow them."""
+        """Take one gradient step on transitions (``now``) and their successors (``after``)."""
         next_values = self.q.apply(state.target, after.kept.seen)
         wanted = targets(now.reward, now.done, next_values, self.hyper.discount)
 
@@ -204,7 +204,7 @@ Rule = Callable[[PRNGKeyArray, View, State], Int[Array, ""]]
 
 
 def following(setting: Setting, params: Any, rule: Rule) -> Adapter:
-    """A high level that learns nothing, as an adapter."""
+    """The adapter of a high level that chooses goals by a fixed rule."""
     config: CommandConfig = setting.network
     agent = hierarchical(
         low_level(config, params, setting.judged),
@@ -216,21 +216,21 @@ def following(setting: Setting, params: Any, rule: Rule) -> Adapter:
 
 
 def make_random(setting: Setting, params: Any, hyper: NoHyper) -> Adapter:
-    """Any goal with the same probability."""
+    """The high level that chooses goals uniformly at random."""
     del hyper
     num = len(setting.network.commands)
     return following(setting, params, lambda key, view, state: jax.random.randint(key, (), 0, num))
 
 
 def make_prior(setting: Setting, params: Any, hyper: NoHyper) -> Adapter:
-    """Goals drawn from the prior."""
+    """The high level that draws goals from the prior."""
     del hyper
     agent = prior_agent(setting.network, params, setting.judged)
     return reference(agent, Choice(jnp.zeros(())))
 
 
 def make_oracle(setting: Setting, params: Any, hyper: NoHyper) -> Adapter:
-    """The goals that the world's expert tells: the ceiling of the hierarchy."""
+    """The high level that chooses the goals of the world's expert: an upper bound for the hierarchy."""
     del hyper
     config: CommandConfig = setting.network
 
@@ -243,7 +243,7 @@ def make_oracle(setting: Setting, params: Any, hyper: NoHyper) -> Adapter:
 
 
 def check_ptgm(setting: Setting, hyper: PtgmHyper) -> None:
-    """Raise ``UsageError`` for a budget in which the high level is never updated."""
+    """Raise ``UsageError`` if the budget is too small for a single update of the high level."""
     config: CommandConfig = setting.network
     most = setting.num_episodes * num_decisions(config.horizon, config.skill_steps)
     if most < hyper.batch_size:
@@ -254,12 +254,12 @@ def check_ptgm(setting: Setting, hyper: PtgmHyper) -> None:
 
 
 def check_oracle(setting: Setting, hyper: NoHyper) -> None:
-    """Raise ``UsageError`` where nobody tells goals to go for."""
+    """Raise ``UsageError`` if the world has no expert that tells goals."""
     del hyper
     env, config = setting.env, setting.network
 
-    def told(key: PRNGKeyArray) -> Array:
+    def expert_goal(key: PRNGKeyArray) -> Array:
         state, _ = env.reset(key, env.sample_task(key))
         return env.expert_goal(state, config.skill_steps)
 
-    jax.eval_shape(told, jax.random.key(0))
+    jax.eval_shape(expert_goal, jax.random.key(0))

@@ -1,7 +1,7 @@
 """Returns and advantages of one episode, whose rewards are 0 after its end.
 
-No value is added for what might have come after the last step: an episode that is cut at the horizon is
-over there, and the policy knows the time.
+Nothing is bootstrapped after the last step: an episode that reaches the horizon is over, and the policy
+observes the timestep.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 def returns_to_go(
     rewards: Float[Array, "T"], discount: float | Float[Array, ""]
 ) -> Float[Array, "T"]:
-    """G_t = r_t + discount * G_{t+1}."""
+    """The discounted returns-to-go, G_t = r_t + discount * G_{t+1}."""
 
     def back(after: Array, reward: Array) -> tuple[Array, Array]:
         now = reward + discount * after
@@ -30,9 +30,9 @@ def advantages(
     discount: float | Float[Array, ""],
     gae_lambda: float | Float[Array, ""],
 ) -> Float[Array, "T"]:
-    """Generalized advantage estimates (Schulman et al., 2016, Eq. 16); 0 where a step is not ``real``.
+    """Generalized advantage estimates (Schulman et al., 2016, Eq. 16); 0 at steps that are not ``real``.
 
-    The value after the last real step is 0.
+    The value after the last real step is taken as 0.
     """
     values = jnp.where(real, values, 0.0)
     errors = rewards + discount * jnp.append(values[1:], 0.0) - values

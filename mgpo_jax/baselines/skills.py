@@ -1,15 +1,17 @@
-"""The low level of SPiRL: skills in a latent space, and a prior of them (paper, appendix F.2, Table 9).
+"""The low level of SPiRL: skills in a latent space, and a prior over them (paper, appendix F.2, Table 9).
 
-An encoder q(z | o_t, a_t .. a_{t+k-1}) reads k actions, a decoder pi(a_t .. a_{t+k-1} | o_t, z) gives them
-back, and a prior p(z | o_t) is fitted to the encoder's draws. The history h_t, which the paper writes
-beside o_t, is left out, as in the code of SPiRL (clvrai/spirl). That code's loss is the mean over steps and
-dimensions of the reconstruction's negative log-likelihood, plus beta times the mean over latent dimensions
-of KL(q, N(0, I)), plus the prior's negative log-likelihood of a draw that gives the encoder no gradient.
-Here the likelihood is that of the world's action head, where the code has a unit Gaussian, and the decoder
-is not fed its own actions, so that all k distributions are known when a skill begins.
+An encoder q(z | o_t, a_t .. a_{t+k-1}) encodes k actions, a decoder pi(a_t .. a_{t+k-1} | o_t, z)
+reconstructs them, and a prior p(z | o_t) is fitted to samples of the encoder. The history h_t, on which the
+paper conditions as well, is left out, as in the code of SPiRL (clvrai/spirl). The loss of that code is a
+sum of three terms: the negative log-likelihood of the reconstruction, averaged over steps and dimensions;
+beta times KL(q, N(0, I)), averaged over latent dimensions; and the prior's negative log-likelihood of a
+sample, with no gradient into the encoder. Here the likelihood is that of the world's action head, where
+their code uses a unit Gaussian, and the decoder is not autoregressive, so that all k distributions are
+known when a skill begins.
 
-The open loop decodes a skill from the observation at its start (the paper's text); with ``loop="closed"``
-every step sees its own observation (the variant that SPiRL's repository recommends).
+The open loop decodes a skill from the observation at its start, as in the paper's text. With
+``loop="closed"`` every step is decoded from its own observation, the variant that SPiRL's repository
+recommends.
 """
 
 from __future__ import annotations
@@ -39,26 +41,27 @@ MIN_LOG_STD, MAX_LOG_STD = -10.0, 2.0  # clvrai/spirl
 
 @dataclass(frozen=True)
 class SkillConfig(NetworkConfig):
-    """Sizes of the networks. Values in brackets are those of Table 9."""
+    """Config of the networks. Values in brackets are those of Table 9."""
 
     __pydantic_config__ = STRICT
 
     embed_dim: Width = 128
     """Width of all layers."""
     num_layers: NumLayers = 3
-    """Hidden layers of the prior and of a closed-loop decoder."""
+    """Number of hidden layers of the prior and of a closed-loop decoder."""
     skill_steps: Annotated[int, Ge(1), Le(10_000)] = 10
-    """Steps k of a skill [10]."""
+    """k, the number of steps of a skill [10]."""
     latent_dim: Annotated[int, Ge(1), Le(4_096)] = 10
-    """Size of z [10]."""
+    """Dimension L of the latent z [10]."""
     beta: NotNegative = 5e-4
     """Weight of the divergence of the encoder from N(0, I) [5e-4]."""
     loop: Literal["open", "closed"] = "open"
-    """Whether a skill is decoded from its first observation, or every step from its own."""
+    """Whether all steps of a skill are decoded from its first observation (``open``), or each step from its
+    own (``closed``)."""
 
 
 class Normal(NamedTuple):
-    """A diagonal Gaussian over latents, whose draws are not clipped."""
+    """A diagonal Gaussian over latents, whose samples are not clipped."""
 
     mean: Float[Array, "*batch L"]
     log_std: Float[Array, "*batch L"]
@@ -83,13 +86,13 @@ def standard(latent_dim: int) -> Normal:
 
 
 def normal_of(params: Float[Array, "*batch L2"]) -> Normal:
-    """A Gaussian from the outputs of a layer."""
+    """The Gaussian whose means and log standard deviations are the outputs of a layer."""
     mean, log_std = jnp.split(params, 2, axis=-1)
     return Normal(mean, jnp.clip(log_std, MIN_LOG_STD, MAX_LOG_STD))
 
 
 class SkillNetwork(nn.Module):
-    """Encoder, decoder and prior of skills."""
+    """The encoder, the decoder and the prior of skills."""
 
     config: SkillConfig
 
@@ -110,12 +113,12 @@ class SkillNetwork(nn.Module):
             self.action_head = Mlp(num_outputs, width, config.num_layers)
 
     def embedded(self, obs: Shaped[Array, "..."]) -> Float[Array, "*batch E"]:
-        """Observations as the other parts take them in."""
+        """The embeddings of observations, which the other parts of the network take."""
         token: Array = nn.relu(self.embed_obs(self.config.standardized(obs)))
         return token
 
     def posterior(self, seen: Float[Array, "W E"], actions: Shaped[Array, "W k ..."]) -> Normal:
-        """q(z | o_t, a_t ..) of W windows."""
+        """q(z | o_t, a_t .. a_{t+k-1}) of W windows."""
         numbers = self.config.action_numbers(actions)
         first = jnp.broadcast_to(seen[:, None], (*numbers.shape[:2], seen.shape[-1]))
         (_, last), _ = self.read_actions(jnp.concatenate([numbers, first], axis=-1))
@@ -130,7 +133,7 @@ class SkillNetwork(nn.Module):
     ) -> Distribution:
         """Action distributions of the steps of a skill, [*batch, k].
 
-        ``seen`` holds the embedded observations of its steps; of the open loop only the first one counts.
+        ``seen`` holds the embedded observations of its steps; the open loop uses only the first one.
         """
         steps = seen.shape[-2]
         every = jnp.broadcast_to(latent[..., None, :], (*seen.shape[:-1], latent.shape[-1]))
@@ -144,32 +147,32 @@ class SkillNetwork(nn.Module):
         return HEADS[self.config.head].make(self.action_head(x))
 
     def __call__(self, key: PRNGKeyArray, obs: Any, actions: Any) -> Reading:
-        """Read W windows of k steps: encode them, draw a latent each, and decode it."""
+        """Encode W windows of k steps, sample a latent for each, and decode it."""
         seen = self.embedded(obs)
         posterior = self.posterior(seen[:, 0], actions)
         latent = posterior.sample(key)
-        # The prior learns from the encoder and from what it sees, and changes neither.
+        # No gradient of the prior reaches the encoder or the embedding of observations.
         prior = self.prior(jax.lax.stop_gradient(seen[:, 0]))
         return Reading(posterior, latent, prior, self.decoded(seen, latent))
 
 
 class Reading(NamedTuple):
-    """What the networks say of W windows of k steps."""
+    """The networks' outputs for W windows of k steps."""
 
     posterior: Normal
     latent: Float[Array, "W L"]
     prior: Normal
     actions: Distribution
-    """[W, k]."""
+    """The decoded action distributions, [W, k]."""
 
 
 def windows(
     key: PRNGKeyArray, length: Int[Array, ""], num_steps: int, skill_steps: int
 ) -> tuple[Int[Array, "W k"], Any]:
-    """Windows of an episode that follow one another from a random step below k on.
+    """Cut an episode into consecutive windows of k steps, starting at a random step below k.
 
     Returns:
-      The steps of W windows, and which windows lie in the episode.
+      The indices of the steps of W windows, and which windows lie within the episode, bool [W].
     """
     offset = jax.random.randint(key, (), 0, skill_steps)
     num = max(num_steps // skill_steps, 1)
@@ -186,9 +189,9 @@ def skill_loss(
     deterministic: bool = False,
     obs_noise: float = 0.0,
 ) -> tuple[Float[Array, ""], Stats]:
-    """The loss of the windows of one trajectory, summed over their steps; see the module's text.
+    """The loss of the windows of one trajectory, summed over their steps; see the module docstring.
 
-    The parts ``kl`` and ``prior`` of the statistics are in nats a step.
+    The parts ``kl`` and ``prior`` of the statistics are in nats per step.
     """
     key_windows, key_latent, key_noise = jax.random.split(key, 3)
     if obs_noise and not deterministic:
@@ -210,7 +213,7 @@ def skill_loss(
 
 
 class Carry(NamedTuple):
-    """What the low level remembers."""
+    """The memory of the low level."""
 
     seen: Float[Array, "*batch E"]
     """The latest observation, embedded."""
@@ -220,9 +223,9 @@ def low_level(config: SkillConfig, params: Any, judged: Judgement) -> LowLevel:
     """The decoder as the low level; a decision is a latent, and a view an embedded observation.
 
     Args:
-      config: the networks.
-      params: their weights.
-      judged: how actions are drawn: as the world judges policies, also in episodes that learn.
+      config: the networks' config.
+      params: their parameters.
+      judged: how actions are chosen. Training episodes use the same way as judging ones.
     """
     network: Any = SkillNetwork(config)
     temperature = jnp.float32(judged.temperature) if judged.tempered else None
@@ -255,14 +258,14 @@ def low_level(config: SkillConfig, params: Any, judged: Judgement) -> LowLevel:
 
 
 def prior_of(config: SkillConfig, params: Any, seen: Array) -> Normal:
-    """p(z | o_t) of an embedded observation."""
+    """p(z | o_t), given the embedded observation."""
     network: Any = SkillNetwork(config)
     found: Normal = network.apply(params, seen, method="prior")
     return found
 
 
 def prior_agent(config: SkillConfig, params: Any, judged: Judgement) -> Agent:
-    """Follows skills drawn from the prior, which knows nothing of the task."""
+    """The agent that follows skills drawn from the prior, which does not depend on the task."""
 
     def decide(key: PRNGKeyArray, seen: Array, state: Any) -> tuple[Array, tuple]:
         del state
@@ -274,13 +277,13 @@ def prior_agent(config: SkillConfig, params: Any, judged: Judgement) -> Agent:
 
 
 def init(key: PRNGKeyArray, config: SkillConfig) -> Any:
-    """Random weights."""
+    """Randomly initialized parameters."""
     obs, actions = (row[None] for row in config.blank_episode(config.skill_steps))
     return SkillNetwork(config).init(key, jax.random.key(0), obs, actions)
 
 
 def facts(config: SkillConfig) -> dict[str, str]:
-    """What a card says of the networks."""
+    """The facts about the networks for a model card."""
     return {
         "network": f"layers of width {config.embed_dim}, {config.loop} loop",
         "skills": f"{config.skill_steps} steps, latents of {config.latent_dim} numbers",

@@ -1,15 +1,16 @@
 """SPiRL: soft actor-critic over pre-trained skills, near their prior (paper, appendix F.2, Table 9).
 
-Every k steps the high level draws a latent z, and the low level (``skills``) acts it out. The high level
-starts as the prior p(z | o_t) and maximizes R - alpha KL(pi, p), where R is the plain sum of the k rewards
-and alpha is learned so that the divergence settles at a target, as in clvrai/spirl. The divergence of two
-Gaussians is taken in closed form here, where that code draws ten samples and squashes latents by 2 tanh. A
-decision that the end of an episode cuts short does not bootstrap.
+Every k steps the high level samples a latent z, and the low level (``skills``) decodes it into actions. The
+high level is initialized with the prior p(z | o_t) and maximizes R - alpha KL(pi, p), where R is the
+undiscounted sum of the k rewards and alpha is learned so that the divergence settles at a target, as in
+clvrai/spirl. Here the divergence of the two Gaussians is computed in closed form, while that code draws ten
+samples and squashes latents by 2 tanh. A decision that is cut short by the end of an episode does not
+bootstrap.
 
-The paper gives the sizes of Table 9, of which the discount, the batch and the interval of the target belong
-to this level. It does not say the target of the divergence, how many decisions are made before the first
-update, nor how often updates follow: here ten episodes of the prior come first, which count, and there is
-one update for every decision. Neither level sees the task goal, which only the reward tells of.
+Of the settings in Table 9, the discount, the batch size and the target interval belong to this level. The
+paper does not give the target divergence, the number of decisions before the first update, nor the number
+of updates. Here the prior acts in the first ten episodes, which count against the budget, and then there is
+one update for every decision. Neither level sees the task goal, which shows only in the reward.
 """
 
 from __future__ import annotations
@@ -50,14 +51,14 @@ from mgpo_jax.trees import choose
 
 
 class Choice(NamedTuple):
-    """How the high level is to choose latents in an episode."""
+    """How the high level chooses latents in an episode."""
 
     greedy: Bool[Array, "*batch"]
-    """Whether it takes the mean of its distribution instead of a draw."""
+    """Whether it takes the mean of its distribution instead of a sample."""
 
 
 class Kept(NamedTuple):
-    """What is kept of a decision."""
+    """The data of a decision that are kept for training."""
 
     seen: Float[Array, "*batch E"]
     """The embedded observation."""
@@ -65,20 +66,20 @@ class Kept(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """What is trained."""
+    """The trained parameters."""
 
     actor: Any
     critics: Any
-    """Two, stacked."""
+    """The parameters of the two critics, stacked."""
     log_alpha: Float[Array, "*batch"]
 
 
 class Learner(NamedTuple):
-    """State of the high level on one task."""
+    """The state of the high level on one task."""
 
     weights: Weights
     target: Any
-    """The critics that values are bootstrapped from."""
+    """The target critics."""
     opt_state: Any
     replay: Replay
     updates: Int[Array, "*batch"]
@@ -89,9 +90,9 @@ class Spirl:
     """SPiRL on one task; all methods are pure.
 
     Args:
-      setting: what is known beforehand.
-      params: weights of the skills.
-      hyper: how the high level learns.
+      setting: the setting (``methods.Setting``).
+      params: the parameters of the skill network.
+      hyper: the hyper-parameters of the high level.
     """
 
     def __init__(self, setting: Setting, params: Any, hyper: SpirlHyper) -> None:
@@ -118,7 +119,7 @@ class Spirl:
         config = self.config
         blank = jnp.zeros(config.embed_dim + config.latent_dim)
         critics = jax.vmap(lambda key: self.critic.init(key, blank))(jax.random.split(key))
-        # The actor starts as the prior: it has its sizes and its weights.
+        # The actor is initialized with the prior, whose architecture it shares.
         actor = {"params": self.low_params["params"]["prior_head"]}
         weights = Weights(actor, critics, jnp.log(jnp.float32(self.hyper.alpha)))
         kept = Kept(jnp.zeros(config.embed_dim), jnp.zeros(config.latent_dim))
@@ -146,7 +147,7 @@ class Spirl:
         return hierarchical(self.low, decide, self.config.skill_steps, self.config.horizon)
 
     def tell(self, key: PRNGKeyArray, state: Learner, choice: Choice, episodes: Episode) -> Learner:
-        """Remember an episode, and update once for every decision in it."""
+        """Add an episode to the replay buffer, and update once for every decision in it."""
         del choice
         episode = jax.tree.map(lambda leaf: leaf[0], episodes)
         new = transitions(episode, self.config.skill_steps)
@@ -157,13 +158,13 @@ class Spirl:
         return jax.lax.fori_loop(0, num, lambda i, state: self._update(keys[i], state), state)
 
     def _update(self, key: PRNGKeyArray, state: Learner) -> Learner:
-        """One gradient step on a batch of the replay."""
+        """Take one gradient step on a batch from the replay buffer."""
         key_draw, key_step = jax.random.split(key)
         now, after = draw(key_draw, state.replay, self.hyper.batch_size)
         return self.improved(key_step, state, now, after)
 
     def divergence(self, policy: Normal, seen: Float[Array, "B E"]) -> Float[Array, "B"]:
-        """KL(pi, p) at some observations."""
+        """KL(pi, p) at B observations, in nats."""
         return policy.kl(prior_of(self.config, self.low_params, seen))
 
     def values(
@@ -177,7 +178,7 @@ class Spirl:
     def improved(
         self, key: PRNGKeyArray, state: Learner, now: Transitions, after: Transitions
     ) -> Learner:
-        """One gradient step on transitions and those that follow them."""
+        """Take one gradient step on transitions (``now``) and their successors (``after``)."""
         key_next, key_now = jax.random.split(key)
         actor, alpha = state.weights.actor, jnp.exp(state.weights.log_alpha)
         seen, then = now.kept.seen, after.kept.seen
@@ -211,14 +212,14 @@ def make_spirl(setting: Setting, params: Any, hyper: SpirlHyper) -> Adapter:
 
 
 def make_prior(setting: Setting, params: Any, hyper: NoHyper) -> Adapter:
-    """Skills drawn from the prior in every episode: what SPiRL starts as."""
+    """The agent that draws skills from the prior in every episode, with which SPiRL starts."""
     del hyper
     agent = prior_agent(setting.network, params, setting.judged)
     return reference(agent, Choice(jnp.zeros((), bool)))
 
 
 def check_spirl(setting: Setting, hyper: SpirlHyper) -> None:
-    """Raise ``UsageError`` for a budget in which the high level is never updated."""
+    """Raise ``UsageError`` if the budget is too small for a single update of the high level."""
     if setting.num_episodes <= hyper.warmup_episodes:
         raise UsageError(
             f"{setting.num_episodes} episodes end before the first update, which follows "

@@ -1,4 +1,4 @@
-"""Which part of a network is trained: all of it, its last layers, or matrices of low rank (LoRA)."""
+"""The part of a network that is fine-tuned: all of it, its last layers, or low-rank matrices (LoRA)."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ class Subset(NamedTuple):
     """The trained part of a network; all functions are pure."""
 
     start: Callable[[PRNGKeyArray], Any]
-    """``(key) -> part`` that leaves the network as it was."""
+    """``(key) -> part``: the initial value, which leaves the network's outputs unchanged."""
     merge: Callable[[Any], Any]
-    """``(part) -> params`` of the whole network."""
+    """``(part) -> params``: the parameters of the whole network."""
 
 
 def subset(name: str, params: Any, rank: int) -> Subset:
-    """The part of that name: ``all``, ``head`` or ``lora``.
+    """The part of a network with a given name.
 
     Args:
-      name: which part.
-      params: the weights of the whole network.
-      rank: of the matrices of ``lora``.
+      name: ``all``, ``head`` or ``lora``.
+      params: the parameters of the whole network.
+      rank: the rank of the matrices of ``lora``.
     """
     layers = params["params"]
     if name == "all":
@@ -40,7 +40,7 @@ def subset(name: str, params: Any, rank: int) -> Subset:
 
 
 def _low_rank(layers: Any, rank: int) -> Subset:
-    """W + A B for every kernel W of the blocks, A random and B zero at the start (Hu et al., 2021)."""
+    """W + A B for every kernel W of the blocks, where A starts random and B zero (Hu et al., 2021)."""
     paths, tree = jax.tree_util.tree_flatten_with_path(layers)
     where = [i for i, (path, _) in enumerate(paths) if _is_block_kernel(path)]
     kernels = {i: paths[i][1] for i in where}

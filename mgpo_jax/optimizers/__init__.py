@@ -1,4 +1,4 @@
-"""Prompt optimizers (paper, section 4.3, Table 2). ``methods.py`` lifts them into methods."""
+"""Prompt optimizers (paper, section 4.3, Table 2). ``methods.py`` turns them into methods."""
 
 from __future__ import annotations
 

@@ -1,21 +1,21 @@
 """The table of prompts under trial, and Algorithm 1 around it (paper, section 3.2, appendix E.1).
 
-UCB, BPE and the explore ablation differ only in which prompt they act with next; ``bandit`` is the
-rest. After the first episode, which evaluates (g^M) greedily, episodes alternate: one samples actions
-under the chosen prompt, the next evaluates a new prompt drawn from the best trajectory so far. The new
-prompt becomes an arm if its return beats the best mean of the table.
+UCB, BPE and the explore ablation differ only in which prompt they act with next; ``bandit`` is what they
+share. The first episode evaluates (g^M) greedily. From then on episodes alternate: one acts with the chosen
+prompt by sampling actions, the next evaluates a new prompt drawn from the best trajectory so far. The new
+prompt becomes an arm if its return is higher than the best mean in the table.
 
-The evaluation of a new prompt is greedy where that gives its exact worth (as in the authors' code), and
-samples actions in a world of chance (as the text has it): there one greedy episode is a draw as well,
-and sampling finds orders of goals that greedy actions never take.
+A new prompt is evaluated greedily in deterministic worlds (as in the authors' code), where one greedy
+episode gives its exact return, and by sampling actions in stochastic worlds (as in the paper's text). There
+a greedy return is random as well, and sampling finds orders of goals that greedy actions never reach.
 
-Where a reward confirms the goals that led to it (``SearchSpace.keep_rewarded``; not in the paper), new
-prompts keep the rewarded goals of the best trajectory and vary what came after them, in content and in
-order: what earned k/n of a sequence is its first k parts, and the rest was evidently not right as it was.
+If a reward confirms the goals that led to it (``SearchSpace.keep_rewarded``; not in the paper), new prompts
+keep the rewarded goals of the best trajectory and vary the goals after them, in content and in order: a
+trajectory that earned k/n of a sequence had its first k parts right, and what followed was evidently wrong.
 
-As in the authors' code the chosen prompt acts by sampling, and among trajectories of equal return the
-newest counts as the best. Unlike it, an arm is inserted when it beats the best *mean* (as the paper has
-it), and the first evaluation counts as an episode.
+As in the authors' code, the chosen prompt acts by sampling, and the newest of several trajectories with the
+best return counts as the best. Unlike in their code, an arm is inserted if it beats the best *mean* (as in
+the paper), and the first evaluation counts as an episode.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from mgpo_jax.rollout import Query
 from mgpo_jax.trees import choose
 
 MAX_ARMS = 64
-SHRINKAGE = 2.0
+SHRINKAGE = 2.0  # pseudo-episodes of the table's mean return in ``estimated_returns``
 
 
 class Arms(NamedTuple):
-    """M prompts with their return statistics; rows from ``size`` on are free."""
+    """A table of M prompts with statistics of their returns; rows from ``size`` on are free."""
 
     prompts: Prompt
     pulls: Float[Array, "M"]
@@ -46,7 +46,7 @@ class Arms(NamedTuple):
     sum_sq: Float[Array, "M"]
     """Sum of squared deviations from the mean (Welford)."""
     entry_return: Float[Array, "M"]
-    """Return of the evaluation that made the prompt an arm."""
+    """Return of the episode after which the prompt was inserted."""
     size: Int[Array, ""]
 
     @property
@@ -89,7 +89,8 @@ def no_goals(horizon: int, goal_dim: int) -> Goals:
 
 
 def insert_arm(arms: Arms, prompt: Prompt, return_: Float[Array, ""]) -> Arms:
-    """A new arm with history {return_}; in a full table it replaces the worst evaluation."""
+    """Insert a prompt with one return; in a full table it replaces the arm of the lowest
+    ``entry_return``."""
     worst = jnp.argmin(jnp.where(arms.taken, arms.entry_return, jnp.inf))
     row = jnp.where(arms.size < len(arms.pulls), arms.size, worst)
     return Arms(
@@ -103,12 +104,12 @@ def insert_arm(arms: Arms, prompt: Prompt, return_: Float[Array, ""]) -> Arms:
 
 
 def estimated_returns(arms: Arms, deterministic: bool) -> Float[Array, "M"]:
-    """What each prompt is expected to return when it acts greedily; -inf for free rows.
+    """The estimated return of each prompt when it acts greedily; -inf for free rows.
 
-    In a deterministic world the one greedy evaluation is the answer. Elsewhere an evaluation is a draw,
-    and the best of many draws is mostly luck (the authors' code reports it): there the estimate is the
-    mean of all returns of the arm, shrunk towards the mean of the table as by ``SHRINKAGE`` more
-    episodes of that return.
+    In a deterministic world this is the return of its one greedy evaluation. In a stochastic world a single
+    return is random, and the best of many is mostly luck (the authors' code reports it). There the estimate
+    is the mean of all returns of the arm, shrunk towards the mean of the whole table as if the arm had
+    ``SHRINKAGE`` more episodes of that return.
     """
     if deterministic:
         return arms.entry_return
@@ -130,22 +131,22 @@ def update_arm(arms: Arms, arm: Int[Array, ""], return_: Float[Array, ""]) -> Ar
 
 
 class BanditState(NamedTuple):
-    """Algorithm 1 between two episodes."""
+    """The state of Algorithm 1 between two episodes."""
 
     task_goal: Float[Array, "G"]
     arms: Arms
     episode: Int[Array, ""]
-    """Episodes told so far."""
+    """Number of episodes so far."""
     arm: Int[Array, ""]
-    """The arm last chosen."""
+    """The arm chosen last."""
     newest: Prompt
-    """The prompt last drawn from the best trajectory."""
+    """The prompt drawn last from the best trajectory."""
     best_return: Float[Array, ""]
     """R*."""
     best_goals: Goals
     """The goals of tau*, the best trajectory so far; none before the first episode."""
     confirmed: Bool[Array, "T"]
-    """Steps of tau* that reached a goal and were rewarded."""
+    """Which steps of tau* reached a goal and were rewarded."""
 
 
 Select = Callable[[PRNGKeyArray, BanditState], Int[Array, ""]]
@@ -153,9 +154,13 @@ Select = Callable[[PRNGKeyArray, BanditState], Int[Array, ""]]
 
 # Long because the four functions of an optimizer share its settings and are read together.
 def bandit(space: SearchSpace, select: Select, act_with_newest: bool = False) -> PromptOptimizer:
-    """Algorithm 1 with ``select(key, state) -> arm``.
+    """Algorithm 1 with a rule that chooses arms.
 
-    ``act_with_newest`` acts with the prompt last drawn, arm or not (the explore ablation).
+    Args:
+      space: the search space.
+      select: ``(key, state) -> arm``, the index of the arm to act with.
+      act_with_newest: act with the newest prompt instead, whether it is an arm or not (the explore
+        ablation).
     """
     num_arms = min(MAX_ARMS, 1 + space.num_episodes // 2)
 
@@ -189,7 +194,7 @@ def bandit(space: SearchSpace, select: Select, act_with_newest: bool = False) ->
         keeps = acts | (state.episode == 0)
         newest = choose(keeps, state.newest, drawn)
         prompt = choose(acts, chosen, newest)
-        # Greedy returns are noisy in stochastic worlds; there new prompts are tried by sampling.
+        # In stochastic worlds greedy returns are noisy, so new prompts are evaluated by sampling.
         greedy = (state.episode == 0) | (~acts & space.deterministic)
         return Query(prompt, greedy), state._replace(arm=arm, newest=newest)
 

@@ -1,8 +1,8 @@
 """BBT: black-box tuning of a continuous prompt by CMA-ES (paper, Algorithm 3, E.3, Eq. 5).
 
-CMA-ES is evosax's. Its default fitness shaping gives tied solutions an averaged, rounded rank, so that
-with ties (returns such as k/n tie all the time) the recombination weights no longer sum to one and the
-step size collapses; ``rank_weights`` orders ties instead and restores the algorithm.
+The implementation of CMA-ES is that of evosax. Its default fitness shaping gives tied solutions an averaged
+and rounded rank. Returns such as k/n are often tied; then the recombination weights no longer sum to one
+and the step size collapses. ``rank_weights`` breaks ties instead, as CMA-ES requires.
 """
 
 from __future__ import annotations
@@ -21,23 +21,25 @@ from mgpo_jax.trees import choose
 
 
 def rank_weights(population: Any, fitness: Float[Array, "L"], state: Any, params: Any) -> Any:
-    """CMA-ES weights by strict rank: ties keep their (random) order in the population."""
+    """CMA-ES weights by strict rank: tied solutions keep their (random) order in the population."""
     del population, state
     return params.weights[jnp.argsort(jnp.argsort(jnp.where(jnp.isnan(fitness), jnp.inf, fitness)))]
 
 
 class BbtState(NamedTuple):
-    """Algorithm 3 between two episodes."""
+    """The state of Algorithm 3 between two episodes."""
 
     task_goal: Float[Array, "G"]
     start: Prompt
     """p_0."""
     start_key: PRNGKeyArray
-    """Draws p_0 from the first trajectory."""
+    """The key with which p_0 is drawn from the first trajectory."""
     projection: Float[Array, "PG d"]
-    """A."""
+    """The random matrix A."""
     cma: Any
+    """The state of CMA-ES."""
     population: Float[Array, "L d"]
+    """The candidates z of the current generation."""
     returns: Float[Array, "L"]
     best_prompt: Prompt
     best_return: Float[Array, ""]
@@ -57,12 +59,12 @@ def bbt(
       space: the search space.
       population_size: lambda [10].
       latent_dim: d, the size of z [not in the paper].
-      std_init: sigma(0), in units of goals: rows of A have unit norm on average [not in the paper;
-        chosen in ``docs/ablations.md``].
+      std_init: sigma(0), the initial step size, in units of goals, since rows of A have unit norm on
+        average [not in the paper; chosen in ``docs/ablations.md``].
     """
 
     def strategy() -> tuple[Any, Any]:
-        # evosax creates arrays when it is imported, before a program could choose its devices.
+        # Imported late, since evosax creates arrays on import, before a program could choose its devices.
         from evosax.algorithms import CMA_ES
 
         cma = CMA_ES(population_size, jnp.zeros(latent_dim), fitness_shaping_fn=rank_weights)
@@ -99,7 +101,7 @@ def bbt(
             population, evolved = cma.ask(key, state.cma, params)
             return state._replace(cma=evolved, population=population)
 
-        # The counter is the same for all tasks, so under vmap this stays a real branch.
+        # The predicate is the same for all tasks, so under vmap this remains a branch, not a select.
         starts = (state.episode > 0) & (place(state) == 0)
         state = jax.lax.cond(starts, breed, lambda state: state, state)
         z = state.population[place(state)]

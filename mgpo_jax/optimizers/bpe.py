@@ -1,9 +1,9 @@
 """MGPO-BPE: act with the prompt most likely to beat the best return (paper, Eq. 4).
 
-The returns of a prompt have a Gaussian posterior N(mu_p, sigma_p) from the prior N(mu_0, sigma_0).
-P(R > R*) = sf((R* - mu_p) / sigma_p) falls with its argument, so the most likely prompt is the one
-with the smallest argument: the tails are compared without ever being computed, and nothing
-underflows (in the authors' code 1 - cdf does, all arms tie and the first one wins).
+The returns of a prompt have a Gaussian posterior N(mu_p, sigma_p), with the prior N(mu_0, sigma_0). Since
+P(R > R*) = sf((R* - mu_p) / sigma_p) decreases in its argument, the most likely prompt is the one with the
+smallest argument. The tail probabilities are never computed, so they cannot underflow. (In the authors'
+code 1 - cdf underflows; then all arms tie and the first one wins.)
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ def posterior(
 ) -> tuple[Float[Array, "M"], Float[Array, "M"]]:
     """Mean and standard deviation of each arm's returns after its history (Eq. 4).
 
-    The spread of a history of one return is unknown and taken as the prior's; that of a longer one
-    is at least ``min_std`` times the prior's, so that equal returns do not collapse the posterior.
+    After a single return the standard deviation of an arm's returns is unknown, and the prior's is used.
+    After more returns it is at least ``min_std`` times the prior's, so that equal returns do not collapse
+    the posterior.
     """
     low, high = return_range
     prior_mean, prior_std = (low + high) / 2, (high - low) / 2
@@ -48,7 +49,7 @@ def bpe(space: SearchSpace, min_std: float | Float[Array, ""] = 0.02) -> PromptO
 
     Args:
       space: the search space; its return range gives the prior (section E.1).
-      min_std: smallest spread of a history, as a share of the prior's.
+      min_std: smallest standard deviation of an arm's returns, as a fraction of the prior's.
     """
 
     def select(key: PRNGKeyArray, state: BanditState) -> Int[Array, ""]:

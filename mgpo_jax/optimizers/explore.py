@@ -1,6 +1,6 @@
 """MGPO-explore: the ablation without a bandit (paper, section 4.3).
 
-Acts with the prompt most recently drawn from the best trajectory, whatever its returns were.
+It acts with the prompt drawn most recently from the best trajectory, whatever its returns were.
 """
 
 from __future__ import annotations

@@ -20,13 +20,13 @@ ADD, DELETE, SWAP = range(3)
 def edit(
     key: PRNGKeyArray, prompt: Prompt, goal: Float[Array, "G"], max_goals: int | Int[Array, ""]
 ) -> Prompt:
-    """One random operation on the goals before the last, among those the prompt allows.
+    """Apply one random operation, of those that the prompt's length allows, to the goals before the last.
 
     Args:
       key: random key.
       prompt: the prompt to edit.
-      goal: the goal that Add inserts.
-      max_goals: longest prompt, the last goal included.
+      goal: the goal that the operation Add inserts.
+      max_goals: number of goals of the longest prompt, including the last goal.
     """
     key_op, key_at, key_swap = jax.random.split(key, 3)
     num_slots = prompt.mask.shape[0]
@@ -35,7 +35,8 @@ def edit(
     op = jnp.argmax(jnp.where(allowed, jax.random.uniform(key_op, (3,)), -1.0))
     op = jnp.where(jnp.any(allowed), op, -1)
 
-    # Ranks run over the edited goals; `source` is the old rank each one comes from, or `NEW`.
+    # `rank` numbers the goals of the edited prompt; `source` is the rank in the old prompt that each of
+    # them comes from, or `new` for the inserted goal.
     new = num_slots
     new_count = count + (op == ADD) - (op == DELETE)
     rank = jnp.arange(num_slots) - (num_slots - 1 - new_count)
@@ -57,12 +58,12 @@ def edit(
 
 
 class GripsState(NamedTuple):
-    """Algorithm 2 between two episodes."""
+    """The state of Algorithm 2 between two episodes."""
 
     prompt: Prompt
     """p*, the prompt being edited."""
     return_: Float[Array, ""]
-    """R*."""
+    """R*, the return of p*."""
     leader: Prompt
     """The best edit of this iteration so far."""
     leader_return: Float[Array, ""]
@@ -70,11 +71,11 @@ class GripsState(NamedTuple):
 
 
 def grips(space: SearchSpace, num_edits: int | Int[Array, ""] = 5) -> PromptOptimizer:
-    """GRIPS with ``num_edits`` edited prompts an iteration, each evaluated greedily once.
+    """GRIPS with ``num_edits`` edited prompts per iteration, each evaluated in one greedy episode.
 
-    The first episode evaluates (g^M); Algorithm 2 leaves its return at -inf. An edit of equal return is
-    accepted, unlike in Algorithm 2: where rewards are sparse, none of the prompts one edit away from (g^M)
-    may be better, and the search would never leave it.
+    There are two differences from Algorithm 2. The first episode evaluates (g^M), whose return Algorithm 2
+    leaves at -inf. And an edit of equal return is accepted: with sparse rewards it can happen that no
+    prompt one edit away from (g^M) is better, and the search would never leave it.
     """
 
     def init(key: PRNGKeyArray, task_goal: Float[Array, "G"]) -> GripsState:
@@ -96,7 +97,8 @@ def grips(space: SearchSpace, num_edits: int | Int[Array, ""] = 5) -> PromptOpti
         leads = episode.return_ > state.leader_return
         leader = choose(leads, query.prompt, state.leader)
         leader_return = jnp.maximum(episode.return_, state.leader_return)
-        ends = state.episode % num_edits == 0  # of the evaluation of (g^M), then of each iteration
+        # An iteration ends after `num_edits` episodes; the evaluation of (g^M) is one of its own.
+        ends = state.episode % num_edits == 0
         moves = ends & (leader_return >= state.return_)
         return GripsState(
             prompt=choose(moves, leader, state.prompt),

@@ -1,4 +1,4 @@
-"""Prompt optimizers as methods: how each is made from its hyper-parameters, and lifted into an adapter."""
+"""Prompt optimizers as methods: each is made from its hyper-parameters and wrapped in an adapter."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ from mgpo_jax.rollout import Query, prompted
 def prompt_adapter(
     policy: Policy, optimizer: PromptOptimizer, judged: Judgement | None = None
 ) -> Adapter:
-    """A prompt optimizer as an adapter: its choices are prompts for a policy that never changes.
+    """Wrap a prompt optimizer in an adapter, whose choices are prompts for a frozen policy.
 
     Args:
-      policy: who acts under the prompts.
-      optimizer: who searches them.
+      policy: the policy that acts under the prompts.
+      optimizer: the prompt optimizer.
       judged: how the best prompt is judged (default: greedily).
     """
     judged = judged or Judgement()
@@ -71,14 +71,14 @@ def prompt_adapter(
 
 
 def judged_query(prompt: Prompt, judged: Judgement) -> Query:
-    """How a prompt is judged."""
+    """The query that judges a prompt."""
     temperature = jnp.float32(judged.temperature) if judged.tempered else None
     greedy = jnp.full(prompt.mask.shape[:-1], judged.mode == "greedy")
     return Query(prompt, greedy, temperature)
 
 
 def fixed_prompt(num_slots: int) -> PromptOptimizer:
-    """Keeps the prompt (g^M) in all episodes: goal-conditioned behavior cloning."""
+    """The optimizer that uses the prompt (g^M) in all episodes: goal-conditioned behavior cloning."""
 
     def init(key: PRNGKeyArray, task_goal: Float[Array, "G"]) -> Prompt:
         del key
@@ -97,7 +97,7 @@ def fixed_prompt(num_slots: int) -> PromptOptimizer:
 
 
 def search_space(setting: Setting, hyper: PromptHyper) -> SearchSpace:
-    """What a prompt optimizer may know in a setting."""
+    """The search space of a prompt optimizer in a setting."""
     spec = setting.env.spec
     return SearchSpace(
         num_slots=setting.network.max_prompt_length,
@@ -112,19 +112,23 @@ def search_space(setting: Setting, hyper: PromptHyper) -> SearchSpace:
 
 
 def make_ucb(setting: Setting, params: Any, hyper: UcbHyper) -> Adapter:
-    return _lifted(setting, params, ucb(search_space(setting, hyper), c=hyper.c, scale=hyper.scale))
+    return _to_adapter(
+        setting, params, ucb(search_space(setting, hyper), c=hyper.c, scale=hyper.scale)
+    )
 
 
 def make_bpe(setting: Setting, params: Any, hyper: BpeHyper) -> Adapter:
-    return _lifted(setting, params, bpe(search_space(setting, hyper), min_std=hyper.min_std))
+    return _to_adapter(setting, params, bpe(search_space(setting, hyper), min_std=hyper.min_std))
 
 
 def make_explore(setting: Setting, params: Any, hyper: ExploreHyper) -> Adapter:
-    return _lifted(setting, params, explore(search_space(setting, hyper)))
+    return _to_adapter(setting, params, explore(search_space(setting, hyper)))
 
 
 def make_grips(setting: Setting, params: Any, hyper: GripsHyper) -> Adapter:
-    return _lifted(setting, params, grips(search_space(setting, hyper), num_edits=hyper.num_edits))
+    return _to_adapter(
+        setting, params, grips(search_space(setting, hyper), num_edits=hyper.num_edits)
+    )
 
 
 def make_bbt(setting: Setting, params: Any, hyper: BbtHyper) -> Adapter:
@@ -134,15 +138,15 @@ def make_bbt(setting: Setting, params: Any, hyper: BbtHyper) -> Adapter:
         latent_dim=hyper.latent_dim,
         std_init=hyper.std_init,
     )
-    return _lifted(setting, params, optimizer)
+    return _to_adapter(setting, params, optimizer)
 
 
 def make_gcbc(setting: Setting, params: Any, hyper: NoHyper) -> Adapter:
     del hyper
-    return _lifted(setting, params, fixed_prompt(setting.network.max_prompt_length))
+    return _to_adapter(setting, params, fixed_prompt(setting.network.max_prompt_length))
 
 
-def _lifted(setting: Setting, params: Any, optimizer: PromptOptimizer) -> Adapter:
+def _to_adapter(setting: Setting, params: Any, optimizer: PromptOptimizer) -> Adapter:
     return prompt_adapter(transformer_policy(setting.network, params), optimizer, setting.judged)
 
 
@@ -157,6 +161,6 @@ def check_prompts(setting: Setting, hyper: PromptHyper) -> None:
 
 
 def check_grips(setting: Setting, hyper: GripsHyper) -> None:
-    """Raise ``UsageError`` where the world draws no goals that could be inserted into a prompt."""
+    """Raise ``UsageError`` if the world cannot sample goals to insert into a prompt."""
     check_prompts(setting, hyper)
     jax.eval_shape(setting.env.sample_goal, jax.random.key(0))

@@ -1,1 +1,2 @@
-"""An own prompt optimizer: a model of the task from everything seen, plans in it, prompts for the plans."""
+"""The prompt optimizer ``plan``: learns a model of the task from all episodes, plans in it, and searches
+for prompts that make the policy follow the plan."""

@@ -1,4 +1,5 @@
-"""Where to explore: frontiers, from where the task goal could be nearer than by any known way."""
+"""Exploration: frontiers, states from which the task goal could be reached sooner than by any known
+path."""
 
 from __future__ import annotations
 
@@ -10,8 +11,8 @@ from mgpo_jax.optimizers.base import SearchSpace
 from mgpo_jax.planning.table import FAR, UNKNOWN, Table, steps_from, way_to
 from mgpo_jax.prompts import Prompt, sample_prompt
 
-# What a frontier costs beside the steps over it: for every time that it was chosen before, for every visit
-# (of at most so many), and by chance.
+# The cost of a frontier, in steps, beyond the estimated length of a path through it: for every time that it
+# was chosen before, for every visit (up to ``MOST_VISITS``), and the scale of a random term.
 COST_OF_CHOICE, COST_OF_VISIT, MOST_VISITS, CHANCE = 2.0, 0.15, 20, 0.7
 
 
@@ -23,18 +24,21 @@ def choose_frontier(
     choices: Int[Array, "N"],
     known: Int[Array, ""],
 ) -> Int[Array, ""]:
-    """The state to head for: one with untried actions over which the task goal could be nearest.
+    """Choose the frontier through which the task goal may be nearest: a state with untried actions.
 
-    How far the task goal is from a state is bounded from below by its distance in goals, in units of the
-    largest step so far.
+    The number of steps from a state to the task goal is bounded from below by the distance between their
+    goals, divided by the largest change of the goal in one step so far.
 
     Args:
       key: random key.
-      table: what is known.
-      start: where episodes start.
+      table: the map of the task.
+      start: the state in which episodes start.
       task_goal: g^M.
       choices: how often each state was chosen before.
-      known: steps of the shortest known way to the task goal.
+      known: number of steps of the shortest known path to the task goal.
+
+    Returns:
+      The index of a state.
     """
     steps = steps_from(table, start)
     away = jnp.sum(jnp.abs(table.goals - task_goal), axis=-1)
@@ -61,9 +65,10 @@ def prompt_over(
     over: Int[Array, ""],
     task_goal: Float[Array, "G"],
 ) -> Prompt:
-    """A random prompt of the shortest way to the state ``over``, that state's goal and the task goal.
+    """A prompt that leads to the task goal by way of the state ``over``.
 
-    There must be room for two goals.
+    It holds random goals of a shortest path to that state, the state's own goal, and the task goal. There
+    must be room for two goals.
     """
     key_way, key_prompt = jax.random.split(key)
     way = way_to(key_way, table, start, over, space.horizon)

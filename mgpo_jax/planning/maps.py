@@ -1,16 +1,19 @@
-"""The plan where goals are states: a map of all episodes, ways on it, and prompts that lead along them.
+"""``plan`` in worlds whose goals are states: a map, paths in it, and prompts to follow them.
 
-After the first episode, which evaluates (g^M), an episode goes to one of three things:
+The first episode evaluates (g^M). Every later episode is spent on one of three things:
 
-- a prompt that is surely better than the best one: its rehearsal (``planning.rehearsal``) arrives sooner;
-- a prompt that may be better: its rehearsal leaves what is known, near enough to the goal;
-- exploring: actions are sampled under a random prompt of the known way, or under one that leads to a
-  frontier, a state from where the task goal could be reached sooner than by the known way.
+- a prompt that is certainly better than the best one: its rehearsal (``planning.rehearsal``) reaches the
+task
+  goal in fewer steps;
+- a prompt that may be better: its rehearsal leaves the map close enough to the task goal;
+- exploration: actions are sampled under a random prompt of the known path, or under one that leads to a
+  frontier, a state from which the task goal could be reached sooner than by the known path.
 
-The first two act greedily. Without rehearsals (an ablation) they are random prompts of the known way.
+In the first two cases actions are greedy. Without rehearsals (an ablation) their prompts are random goals
+of the known path.
 
-A map that is full knows nothing of the states that it has no room for. Where the best episode arrived
-through such states, sooner than any known way does, prompts are drawn from it instead, as in the paper.
+A full map ignores further states. If the best episode reached the task goal through such states, sooner
+than any path in the map does, prompts are drawn from that episode instead, as in the paper.
 """
 
 from __future__ import annotations
@@ -57,59 +60,60 @@ from mgpo_jax.rollout import Query
 from mgpo_jax.trees import choose
 
 MOST_PATIENCE = 16
-"""Episodes after which a search is made again at the latest, where those before found nothing."""
+"""Largest number of episodes between two searches, reached when repeated searches find nothing."""
 NUM_ARMS = 64
-"""Room for the prompts that were acted with greedily."""
+"""Capacity of the table of prompts that were run greedily."""
 
 
 class MapState(NamedTuple):
-    """The plan between two episodes."""
+    """The state of the optimizer between two episodes."""
 
     task_goal: Float[Array, "G"]
     table: Table
     start: Int[Array, ""]
     """The state in which the latest episode started."""
     choices: Int[Array, "N"]
-    """How often each state was the frontier to head for."""
+    """How often each state was chosen as the frontier to explore."""
     prompts: Arms
-    """The prompts that were acted with greedily, with their returns."""
+    """The prompts that were run greedily, with their returns."""
     verified: Int[Array, ""]
-    """Steps of the shortest greedy episode that arrived; ``FAR`` before."""
+    """Steps of the shortest greedy episode that reached the task goal; ``FAR`` if none has."""
     best_return: Float[Array, ""]
     """The best return of any episode."""
     latest: Goals
     """The goals of the latest episode."""
     best_goals: Goals
-    """Those of the latest of the best episodes."""
+    """The goals of the best episode; of several equal ones, the latest."""
     best_steps: Int[Array, ""]
-    """How many steps that took to arrive; ``FAR`` if it did not."""
+    """Number of steps in which that episode reached the task goal; ``FAR`` if it did not."""
     memory: Memory
-    """What the latest search has left."""
+    """The prompts that the latest search passes on to the next one."""
     patience: Int[Array, ""]
-    """Episodes between searches, which doubles when one has found nothing."""
+    """Number of episodes between searches; it doubles when a search finds nothing."""
     wait: Int[Array, ""]
-    """Episodes until the next search."""
+    """Number of episodes until the next search."""
     shortest: Int[Array, ""]
-    """Steps of the shortest way that was known at the latest search."""
+    """Steps of the shortest path that was known at the latest search."""
     num_asked: Int[Array, ""]
+    """Number of episodes so far."""
     num_rehearsed: Int[Array, ""]
-    """Prompts rehearsed so far."""
+    """Number of prompts rehearsed so far."""
 
 
 # Long because the four functions of an optimizer share its settings and are read together.
 def plan_map(
     space: SearchSpace, spec: EnvSpec, policy: Policy, num_states: int, features: Features
 ) -> PromptOptimizer:
-    """The plan in a world whose goals are states.
+    """The optimizer ``plan`` for a world whose goals are states.
 
     Args:
-      space: what may be known of the world and of the policy.
-      spec: the world.
-      policy: who rehearses, as it acts in episodes.
-      num_states: room for states in the map.
-      features: what the plan makes use of.
+      space: the search space.
+      spec: the world's specification.
+      policy: the policy, which rehearses prompts in the map as it would act in episodes.
+      num_states: capacity of the map, in states.
+      features: the parts of the method that are used.
     """
-    if space.num_slots == 1:  # there is one prompt, and nothing to search
+    if space.num_slots == 1:  # (g^M) is the only prompt, so there is nothing to search
         features = Features(rounds=0, steering=0, splice=features.splice, frontier=False)
     world = Seen(spec, spec.horizon)
     tools = Tools(space, world, policy, features)
@@ -138,11 +142,11 @@ def plan_map(
         )
 
     def ask(key: PRNGKeyArray, state: MapState) -> tuple[Query, MapState]:
-        # One task after another, so that a search is made for those tasks alone that need one.
+        # One task after another, so that only the tasks that need a search pay for one.
         return in_turn(partial(_next_query, tools))(key, state)
 
     def tell(state: MapState, query: Query, episode: Episode) -> MapState:
-        return in_turn(partial(_told, tools))(state, query, episode)
+        return in_turn(partial(_update, tools))(state, query, episode)
 
     def best(state: MapState) -> Prompt:
         index = jnp.argmax(estimated_returns(state.prompts, space.deterministic))
@@ -153,7 +157,7 @@ def plan_map(
 
 
 def _next_query(tools: Tools, key: PRNGKeyArray, state: MapState) -> tuple[Query, MapState]:
-    """What to run in the next episode."""
+    """Choose the prompt of the next episode, after a search if one is due."""
     space, features = tools.space, tools.features
     key_way, key_search, key_explore = jax.random.split(key, 3)
     goal = find_state(state.table, state.task_goal)
@@ -192,7 +196,7 @@ def _next_query(tools: Tools, key: PRNGKeyArray, state: MapState) -> tuple[Query
         choose(found.sure.exists, found.sure.prompt, choose(hopes, found.hopeful.prompt, explores)),
     )
     chosen = jnp.where(greedy | (frontier == UNKNOWN), len(state.choices), frontier)
-    # A search that finds nothing is made again later and later, until there is something new.
+    # As long as searches find nothing, they become rarer; a shorter known path resets that.
     patience = jnp.minimum(2 * state.patience, MOST_PATIENCE)
     patience = jnp.where(found.sure.exists | (known < state.shortest), 1, patience)
     return Query(prompt, greedy), state._replace(
@@ -207,7 +211,8 @@ def _next_query(tools: Tools, key: PRNGKeyArray, state: MapState) -> tuple[Query
 
 
 def lies_beyond(state: MapState, way: Way) -> Bool[Array, ""]:
-    """Whether the best episode arrived sooner than any known way does, since the map has no more room."""
+    """Whether the map is full and the best episode reached the task goal sooner than any path in the
+    map."""
     is_full = state.table.size == len(state.table.goals)
     return is_full & (state.best_steps < way.steps)
 
@@ -217,8 +222,9 @@ def explore(
 ) -> tuple[Prompt, Int[Array, ""]]:
     """A prompt to explore with, and the frontier that it leads to (``UNKNOWN`` for none).
 
-    It is a random prompt of the known way, or of the latest episode as long as no way is known; in two of
-    four turns it leads to a frontier. Where the best episode lies beyond the map, it is a prompt of that.
+    The prompt holds random goals of the known path, or of the latest episode if no path is known. In two of
+    every four turns it leads to a frontier instead. If the best episode lies beyond the map, its goals are
+    used in every turn.
     """
     space = tools.space
     key_subset, key_frontier = jax.random.split(key)
@@ -244,11 +250,11 @@ def explore(
     return result
 
 
-def _told(tools: Tools, state: MapState, query: Query, episode: Episode) -> MapState:
-    """The plan after an episode."""
+def _update(tools: Tools, state: MapState, query: Query, episode: Episode) -> MapState:
+    """The state of the optimizer after an episode."""
     improves = episode.return_ >= state.best_return
     table = state.table
-    if not tools.features.splice:  # the map is that of the best episode alone
+    if not tools.features.splice:  # the map holds the best episode alone
         table = choose(improves, forgotten(table), table)
     added, start = add_episode(table, episode)
     if not tools.features.splice:

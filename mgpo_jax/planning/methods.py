@@ -1,4 +1,4 @@
-"""How the method ``plan`` is made: with the model that fits what a world says of itself."""
+"""The factory of the method ``plan``, which chooses the kind of model by the world's specification."""
 
 from __future__ import annotations
 

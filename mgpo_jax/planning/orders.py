@@ -1,10 +1,11 @@
-"""The plan where rewards confirm goals: what is known of the order that a task wants, what is ruled out.
+"""``plan`` in worlds whose rewards confirm goals: infers the order of goals that a task requires.
 
 In worlds that reward a sequence part by part (``EnvSpec.reward_confirms_goals``), the longest sequence of
-rewarded goals so far is how the order begins, and the goal that followed it unrewarded is not the next. A
-prompt names what is confirmed, then a goal that may be next, then the others in a random order. Once an
-episode earns all, the order is known, and what is left is to find a prompt under which the policy follows
-it: the whole order, without one of its goals, or with goals that are moved a little.
+rewarded goals so far is a prefix of the required order, and a goal that followed it without a reward is not
+the next one. A prompt names the confirmed goals, then a candidate for the next goal, then the others in a
+random order. Once an episode earns the full return, the order is known. Then a prompt is sought under which
+the policy follows it: the whole order, the order without one of its goals, or the order with slightly moved
+goals.
 """
 
 from __future__ import annotations
@@ -25,34 +26,35 @@ from mgpo_jax.rollout import Query
 from mgpo_jax.trees import choose
 
 MAX_GOALS = 64
-"""Room for different goals; further ones are not kept."""
+"""Capacity of the table of distinct goals; further goals are ignored."""
 NUM_ARMS = 64
-"""Room for the prompts that were acted with greedily."""
+"""Capacity of the table of prompts that were run greedily."""
 NONE = -1
-SAME = 1e-4  # goals that differ by less are the same
-ENOUGH = 1e-4  # a return this near to the largest one is the largest
+SAME = 1e-4  # goals whose components all differ by less are the same
+ENOUGH = 1e-4  # tolerance for a return that counts as the largest possible one
 MOVED = 0.1
-"""Standard deviation of the smallest noise on the goals of a known order; the largest is three times it."""
-# Returns that the whole order, and the order without one of its goals, are expected to have beforehand, and
-# how many episodes that expectation is worth; the spread of returns in a world of chance.
+"""Smallest standard deviation of the noise on the goals of a known order; the largest is three times
+this."""
+# Prior mean of the return of the whole order, and of the order without one of its goals; the weight of the
+# prior in episodes; and the standard deviation of returns in stochastic worlds.
 PRIOR_WHOLE, PRIOR_WITHOUT, PRIOR_WEIGHT, SPREAD = 0.9, 0.6, 2.0, 0.25
 
 
 class Order(NamedTuple):
-    """What is known of the order, for M goals that were reached."""
+    """What is known about the required order, given the M goals that were reached so far."""
 
     goals: Float[Array, "M G"]
     reached: Float[Array, "M"]
-    """How often each was reached."""
+    """How often each goal was reached."""
     size: Int[Array, ""]
     prefix: Int[Array, "W"]
-    """The goals that the order begins with, ``NONE`` after the last one that is confirmed."""
+    """Indices of the confirmed first goals of the order, followed by ``NONE``."""
     excluded: Bool[Array, "M"]
-    """Those that are not the next after the prefix."""
+    """Which goals are ruled out as the next one after the prefix."""
     tried: Float[Array, "M"]
-    """How often each was tried as the next after the prefix."""
+    """How often each goal was tried as the next one after the prefix."""
     complete: Bool[Array, ""]
-    """Whether an episode earned all with this prefix, which then is the order."""
+    """Whether an episode with this prefix earned the full return, so that the prefix is the whole order."""
 
     @property
     def length(self) -> Int[Array, ""]:
@@ -61,13 +63,13 @@ class Order(NamedTuple):
 
     @property
     def confirmed(self) -> Bool[Array, "M"]:
-        """Which goals are in the prefix."""
+        """Which of the M goals are in the prefix."""
         numbers = jnp.arange(len(self.goals))
         return jnp.any(self.prefix[:, None] == numbers, axis=0)
 
 
 def no_order(num_places: int, goal_dim: int) -> Order:
-    """Nothing known, with room for an order of ``num_places`` goals."""
+    """The knowledge before the first episode, with room for an order of ``num_places`` goals."""
     nothing = jnp.zeros(MAX_GOALS)
     return Order(
         goals=jnp.zeros((MAX_GOALS, goal_dim)),
@@ -81,9 +83,10 @@ def no_order(num_places: int, goal_dim: int) -> Order:
 
 
 def observe(order: Order, episode: Episode, largest_return: float) -> Order:
-    """What is known of the order after an episode.
+    """Update the knowledge about the order with an episode.
 
-    A reward without a goal reached, such as for a mistake that was undone, confirms only what came before.
+    After a reward at a step that reached no goal, such as for undoing a mistake, the rewards of the episode
+    no longer tell which goal was right, so only the steps before it are used.
     """
     steps = episode.trajectory
     time = jnp.arange(len(steps.goal_reached))
@@ -120,7 +123,10 @@ def observe(order: Order, episode: Episode, largest_return: float) -> Order:
 def _registered(
     order: Order, goals: Float[Array, "T G"], events: Bool[Array, "T"]
 ) -> tuple[Order, Int[Array, "T"]]:
-    """The order with the goals that were reached, and the number of each event's goal."""
+    """Add the goals of an episode's T steps to the table; also returns the index of the goal of each step.
+
+    Steps that reach no goal (``events``) have the index ``NONE``.
+    """
 
     def register(order: Order, row: tuple[Array, Array]) -> tuple[Order, Array]:
         goal, happens = row
@@ -141,9 +147,9 @@ def _registered(
 
 
 def next_goal(key: PRNGKeyArray, order: Order) -> Int[Array, ""]:
-    """The goal to try after the prefix: rather one that is often reached and was seldom tried.
+    """Draw the goal to try after the prefix, with a preference for goals often reached and seldom tried.
 
-    Returns ``NONE`` where no goal is left.
+    Returns its index, or ``NONE`` if no goal is left.
     """
     rest = (jnp.arange(MAX_GOALS) < order.size) & ~order.confirmed
     possible = rest & ~order.excluded
@@ -161,7 +167,8 @@ def plan_prompt(
     num_slots: int,
     max_goals: int | Int[Array, ""],
 ) -> Prompt:
-    """What is confirmed, then ``first``, then the other goals in a random order, and the task goal."""
+    """The prompt of the confirmed goals, then ``first``, then the others in a random order, then the task
+    goal."""
     num_inner = num_slots - 1
     numbers = jnp.arange(MAX_GOALS)
     others = (numbers < order.size) & ~order.confirmed & (numbers != first)
@@ -187,7 +194,10 @@ def _right_aligned(
     task_goal: Float[Array, "G"],
     max_goals: int | Int[Array, ""],
 ) -> Prompt:
-    """The prompt of the first ``count`` goals of a sequence, as far as there is room."""
+    """The prompt of the first ``count`` goals of a sequence and the task goal, as far as there is room.
+
+    ``sequence`` holds indices of goals. Empty slots come first.
+    """
     num_inner = len(sequence)
     count = jnp.minimum(count, jnp.minimum(num_inner, max_goals - 1))
     place = jnp.arange(num_inner) - (num_inner - count)
@@ -198,7 +208,7 @@ def _right_aligned(
 
 
 def without(prompt: Prompt, slot: Int[Array, ""]) -> Prompt:
-    """The prompt without the goal in one of its slots; a slot that is empty changes nothing."""
+    """The prompt without the goal in one of its slots; unchanged if that slot is empty."""
     places = jnp.arange(len(prompt.mask))
     source = jnp.where(places <= slot, places - 1, places)
     mask = prompt.mask[source] & (source >= 0)
@@ -208,32 +218,33 @@ def without(prompt: Prompt, slot: Int[Array, ""]) -> Prompt:
 
 
 class OrderState(NamedTuple):
-    """The plan between two episodes."""
+    """The state of the optimizer between two episodes."""
 
     key: PRNGKeyArray
-    """For what is planned; ``tell`` is given none."""
+    """Random key of the next plan, since ``tell`` is given none."""
     task_goal: Float[Array, "G"]
     order: Order
     first: Int[Array, ""]
-    """The goal that the latest prompt tried as the next; ``NONE`` for none."""
+    """Index of the goal that the latest prompt tried as the next one; ``NONE`` for none."""
     planned: Prompt
-    """What is planned for the next episode, as long as the order is not complete."""
+    """The prompt for the next episode, as long as the order is not complete."""
     planned_first: Int[Array, ""]
+    """Index of the goal that ``planned`` tries as the next one."""
     prompts: Arms
-    """The prompts that were acted with greedily, with their returns."""
+    """The prompts that were run greedily, with their returns."""
     variant: Int[Array, ""]
-    """Which variant of the complete order the latest prompt was; ``NONE`` for none. 0 is the whole order, i
-    the order without the goal in slot i - 1."""
+    """The variant of the complete order in the latest prompt; ``NONE`` for none. Variant 0 is the whole
+    order, variant i the order without the goal in slot i - 1."""
     pulls: Float[Array, "V"]
-    """Episodes of each variant."""
+    """Number of episodes of each variant."""
     earned: Float[Array, "V"]
-    """The sum of their returns."""
+    """Sum of the returns of each variant."""
     num_variants: Int[Array, ""]
-    """Variants tried, those with moved goals included."""
+    """Number of episodes with a variant, including those with moved goals."""
 
 
 def plan_order(space: SearchSpace) -> PromptOptimizer:
-    """The plan in a world whose rewards confirm goals."""
+    """The optimizer ``plan`` for a world whose rewards confirm goals."""
     num_slots = space.num_slots
 
     def init(key: PRNGKeyArray, task_goal: Float[Array, "G"]) -> OrderState:
@@ -262,12 +273,12 @@ def plan_order(space: SearchSpace) -> PromptOptimizer:
 
 
 def _ask(space: SearchSpace, key: PRNGKeyArray, state: OrderState) -> tuple[Query, OrderState]:
-    """What is planned, or a variant of the complete order."""
+    """Return the planned prompt or, once the order is complete, one of its variants."""
     prompt, variant = _next_variant(key, space, state)
     complete = state.order.complete
     prompt = choose(complete, prompt, state.planned)
     again = is_tried(state.prompts, prompt) & space.deterministic
-    greedy = complete | ~again  # once more, it would show nothing new
+    greedy = complete | ~again  # a repeated greedy episode would be the same as before
     return Query(prompt, greedy), state._replace(
         first=jnp.where(complete, NONE, state.planned_first),
         variant=jnp.where(complete, variant, NONE),
@@ -276,9 +287,9 @@ def _ask(space: SearchSpace, key: PRNGKeyArray, state: OrderState) -> tuple[Quer
 
 
 def _tell(space: SearchSpace, state: OrderState, query: Query, episode: Episode) -> OrderState:
-    """What is known after an episode, and the plan for the next one."""
+    """Update the knowledge about the order, and plan the next prompt."""
     order = observe(state.order, episode, space.return_range[1])
-    # What it was tried after is the prefix before this episode.
+    # The goal was tried after the prefix known before this episode; if that grew, the trial does not count.
     same = order.length == state.order.length
     row = jnp.where(same & (state.first != NONE), state.first, MAX_GOALS)
     order = order._replace(tried=order.tried.at[row].add(1.0, mode="drop"))
@@ -307,18 +318,18 @@ def _whole(state: OrderState, max_goals: int | Int[Array, ""]) -> Prompt:
 def _variant_of(
     state: OrderState, index: Int[Array, ""], max_goals: int | Int[Array, ""]
 ) -> Prompt:
-    """A variant of the complete order by its number."""
+    """The prompt of variant ``index`` of the complete order (``OrderState.variant``)."""
     prompt = _whole(state, max_goals)
     return choose(index == 0, prompt, without(prompt, jnp.maximum(index - 1, 0)))
 
 
 def _possible(state: OrderState, max_goals: int | Int[Array, ""]) -> Bool[Array, "V"]:
-    """Which variants there are: the whole order, and one without each of its goals."""
+    """Which of the V variants exist: the whole order, and for each of its goals the order without it."""
     return jnp.append(True, _whole(state, max_goals).mask[:-1])
 
 
 def _estimates(state: OrderState, max_goals: int | Int[Array, ""]) -> Float[Array, "V"]:
-    """What each variant is expected to return; -inf for those that there are not."""
+    """The estimated return of each variant; -inf for variants that do not exist."""
     prior = jnp.full(len(state.pulls), PRIOR_WITHOUT).at[0].set(PRIOR_WHOLE)
     mean = (state.earned + PRIOR_WEIGHT * prior) / (state.pulls + PRIOR_WEIGHT)
     return jnp.where(_possible(state, max_goals), mean, -jnp.inf)
@@ -327,14 +338,17 @@ def _estimates(state: OrderState, max_goals: int | Int[Array, ""]) -> Float[Arra
 def _next_variant(
     key: PRNGKeyArray, space: SearchSpace, state: OrderState
 ) -> tuple[Prompt, Int[Array, ""]]:
-    """The variant of the complete order to act with, and its number; ``NONE`` for moved goals."""
+    """The variant of the complete order to run next, and its index.
+
+    The index is ``NONE`` in deterministic worlds, where no estimates of variants are needed.
+    """
     longest, num_slots = space.longest, space.num_slots
     if not space.deterministic:
         spread = SPREAD / jnp.sqrt(state.pulls + PRIOR_WEIGHT)
         drawn = _estimates(state, longest) + spread * jax.random.normal(key, spread.shape)
         index = jnp.argmax(drawn)
         return _variant_of(state, index, longest), index
-    # The greedy episode of each variant is the same every time, so each is tried once.
+    # The greedy episodes of a variant are all the same, so each variant is tried once.
     left = jnp.sort(jnp.where(_possible(state, longest), jnp.arange(num_slots), num_slots))
     index = left[jnp.minimum(state.num_variants, num_slots - 1)]
     is_moved = (index == num_slots) | (state.num_variants >= num_slots)
@@ -345,12 +359,12 @@ def _next_variant(
 
 
 def _best_tried(state: OrderState) -> Prompt:
-    """The prompt of the best greedy episode, where each prompt's is always the same."""
+    """The prompt of the best greedy episode, in deterministic worlds."""
     return state.prompts.prompt(jnp.argmax(estimated_returns(state.prompts, deterministic=True)))
 
 
 def moved_goals(key: PRNGKeyArray, prompt: Prompt) -> Prompt:
-    """The prompt with noise on all its goals but the last."""
+    """The prompt with Gaussian noise on all of its goals but the last."""
     key_size, key_noise = jax.random.split(key)
     size = MOVED * jax.random.randint(key_size, (), 1, 4)
     noise = size * jax.random.normal(key_noise, prompt.goals.shape)

@@ -1,4 +1,5 @@
-"""Prompts for a way: random ones of its goals, and changed ones."""
+"""Proposals of prompts that may lead along a path: random subsets of its goals, crossovers and
+mutations."""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ def random_prompts(
     max_goals: int | Int[Array, ""],
     num: int,
 ) -> Prompt:
-    """That many prompts [num] of goals on a way, drawn as prompts are drawn from a trajectory."""
+    """Draw ``num`` prompts from the goals on a path, as prompts are drawn from a trajectory
+    (``sample_prompt``)."""
     keys = jax.random.split(key, num)
     draw = lambda key: sample_prompt(key, way, task_goal, num_slots, max_goals)  # noqa: E731
     return jax.vmap(draw)(keys)
@@ -30,9 +32,10 @@ def random_prompts(
 def crossed(
     key: PRNGKeyArray, prompt: Prompt, other: Prompt, way: Goals, max_goals: int | Int[Array, ""]
 ) -> Prompt:
-    """The goals of one prompt up to a random place on the way, and those of another from there on.
+    """Cross two prompts at a random place on the path.
 
-    Where that makes more goals than there may be, the first ones are left out.
+    The result has the goals of the first prompt up to that place, and those of the other after it. If that
+    makes more than ``max_goals`` goals, the first ones are left out.
     """
     num_inner = len(prompt.mask) - 1
     cut = jax.random.randint(key, (), 0, jnp.maximum(way.length, 1))
@@ -42,12 +45,12 @@ def crossed(
     used = jnp.concatenate([prompt.mask[:-1], other.mask[:-1]])
     used &= jnp.where(from_first, place < cut, place >= cut)
     order = jnp.argsort(jnp.where(used, place, -1))[num_inner:]  # unused ones first
-    # One that was used and left out may leave too many of those behind it only if there was no room.
+    # The goals to be kept are the last `max_goals` - 1 of these, so the slots before them are emptied.
     has_room = jnp.arange(num_inner) >= num_inner - (max_goals - 1)
     return _ordered(goals[order], used[order] & has_room, place[order], prompt.goals[-1])
 
 
-# Long because the five changes share what they draw.
+# Long because the five mutations share their random draws.
 def changed(
     key: PRNGKeyArray,
     prompt: Prompt,
@@ -56,19 +59,20 @@ def changed(
     stride: Float[Array, ""],
     around: Int[Array, ""],
 ) -> Prompt:
-    """A prompt with one change: a goal of the way inserted, one deleted, replaced, disturbed or shifted.
+    """Mutate one goal of a prompt: insert one of the path, or delete, replace, disturb or shift one.
 
-    Goals stand in the order of the places on the way that they are nearest to. One is disturbed by normal
-    noise of half a step to four steps, which points beside the way: a policy that cuts a corner can be led
-    around it. Half of the changes are made near to the place ``around``.
+    The goals of the result are sorted by the place on the path that they are nearest to. A disturbed goal
+    gets normal noise with a scale of half a step to four steps, so that it may lie off the path: a policy
+    that cuts a corner can be led around it that way. Half of the mutations are made near the place
+    ``around``.
 
     Args:
       key: random key.
-      prompt: the prompt to change. Its last goal stays.
-      way: goals on a way. The last one, where the way ends, is not inserted.
-      max_goals: the longest prompt, the last goal included.
-      stride: how far a step changes a goal.
-      around: a place on the way, such as where a rehearsal of the prompt left it.
+      prompt: the prompt to mutate. Its last goal stays.
+      way: the goals on a path. The last one, at its end, is never inserted.
+      max_goals: number of goals of the longest prompt, including the last goal.
+      stride: the change of the goal in one step, as a sum over its components.
+      around: a place on the path (index of a step), such as where a rehearsal of the prompt left the path.
     """
     keys = jax.random.split(key, 8)
     key_op, key_slot, key_place, key_noise, key_size, key_shift, key_near, key_is_near = keys
@@ -84,7 +88,7 @@ def changed(
     score = jax.random.uniform(key_slot, used.shape)
     score = jnp.where(is_near, 1 / (1 + jnp.abs(place - around) + 2 * score), score)
     slot = jnp.argmax(jnp.where(used, score, -1.0))
-    slot = jnp.where(op == INSERT, 0, slot)  # the first slot is empty as long as there is room
+    slot = jnp.where(op == INSERT, 0, slot)  # slot 0 is empty as long as there is room
 
     near = around + jax.random.randint(key_near, (), -FARTHEST_NEAR, FARTHEST_NEAR + 1)
     anywhere = jax.random.randint(key_place, (), 0, num_inner)
@@ -103,7 +107,7 @@ def changed(
 
 
 def _nearest(goal: Float[Array, "G"], way: Goals) -> Int[Array, ""]:
-    """The place on a way that a goal is nearest to."""
+    """The place on a path (index of a step) that a goal is nearest to."""
     distance = jnp.sum(jnp.abs(way.achieved_goals - goal), axis=-1)
     return jnp.argmin(jnp.where(way.goal_reached, distance, jnp.inf))
 
@@ -114,7 +118,7 @@ def _ordered(
     place: Int[Array, "W"],
     last: Float[Array, "G"],
 ) -> Prompt:
-    """The prompt of the used goals by their places, and the last one."""
+    """The prompt of the used goals, sorted by their places on the path, and the last goal."""
     order = jnp.argsort(jnp.where(used, place, -1))  # unused slots first
     mask = jnp.append(used[order], True)
     goals = jnp.concatenate([goals[order], last[None]])

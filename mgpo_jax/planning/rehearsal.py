@@ -1,7 +1,7 @@
-"""Prompts tried out without an episode: the frozen policy acts in the table of what was seen.
+"""Rehearsals: the frozen policy tries prompts in the table of known states, without a real episode.
 
-Where the table holds everything that the policy comes to, in a world without chance, a rehearsal is what an
-episode would be. Where it leaves what is known, it says from where on.
+In a deterministic world a rehearsal that visits only known states is exactly what an episode would be. If
+it takes an action whose result is unknown, it tells how far it came.
 """
 
 from __future__ import annotations
@@ -20,16 +20,18 @@ from mgpo_jax.prompts import Prompt
 from mgpo_jax.rollout import Query, rollout
 
 HOPE = 2
-"""Steps that a way beyond what is known is taken to cost, beside those that are known to be left."""
-TOGETHER = 8  # rehearsals that share a clock: their memories fit into the cache near a core
-# Ranks put the expected steps first, then what is left, then how long it kept to a shortest way.
+"""Assumed cost, in steps, of an action whose result is unknown, beyond the known number of remaining
+steps."""
+TOGETHER = 8  # rehearsals that run in one batch: their KV caches fit into the cache of a CPU core
+# A rank packs three numbers in base 1024, most significant first: the expected steps, the steps left at the
+# best moment, and for how long the rehearsal kept to a shortest path.
 _DIGITS = 1024
 
 ARRIVES, LEAVES, FAILS = range(3)
 
 
 class Ahead(NamedTuple):
-    """What is to be tried: a way through the table of what was seen."""
+    """The task of a rehearsal: to reach a state in the table of known states."""
 
     table: Table
     start: Int[Array, ""]
@@ -37,25 +39,27 @@ class Ahead(NamedTuple):
     left: Int[Array, "N"]
     """The fewest known steps from each state to the goal (``table.steps_to``)."""
     limit: Int[Array, ""]
-    """A rehearsal is given up where it has no known way left to arrive after so many steps in all."""
+    """Largest total number of steps: a rehearsal ends once no known path reaches the goal within it."""
 
 
 class Place(NamedTuple):
-    """A rehearsal in progress."""
+    """The state of a rehearsal in progress."""
 
     ahead: Ahead
     state: Int[Array, ""]
-    """``UNKNOWN`` once it has left what is known."""
+    """The current state; ``UNKNOWN`` after an action whose result is unknown."""
     steps: Int[Array, ""]
 
 
 @dataclass(frozen=True)
 class Seen(Environment):
-    """A world as far as it was seen, as a world: its tasks are ``Ahead``, its goals numbers of states.
+    """The environment in which rehearsals run: the known part of a world.
+
+    Its tasks are of the type ``Ahead``, and its goals are indices of states.
 
     Attributes:
-      world: the world that was seen.
-      longest: number of steps after which a rehearsal ends in any case.
+      world: the specification of the real world.
+      longest: the horizon of a rehearsal, in steps.
     """
 
     world: EnvSpec
@@ -68,15 +72,15 @@ class Seen(Environment):
     def reset(self, key: Array, task: Ahead) -> tuple[Place, TimeStep]:
         del key
         place = Place(task, task.start, jnp.int32(0))
-        return place, self._seen(place)
+        return place, self._timestep(place)
 
     def step(self, state: Place, action: Array) -> tuple[Place, TimeStep]:
         known = state.ahead.table.successors[state.state, action]
         after = jnp.where(state.state == UNKNOWN, UNKNOWN, known)
         place = Place(state.ahead, after, state.steps + 1)
-        return place, self._seen(place)
+        return place, self._timestep(place)
 
-    def _seen(self, place: Place) -> TimeStep:
+    def _timestep(self, place: Place) -> TimeStep:
         ahead = place.ahead
         number = place.state[None].astype(jnp.float32)
         return TimeStep(
@@ -91,43 +95,43 @@ class Seen(Environment):
 
 
 class Rehearsal(NamedTuple):
-    """What came of trying a prompt in the table."""
+    """The results of rehearsing C prompts."""
 
     ends: Int[Array, "*C"]
-    """``ARRIVES`` at the goal, ``LEAVES`` what is known, or ``FAILS``."""
+    """How it ended: ``ARRIVES`` at the goal, ``LEAVES`` the known states, or ``FAILS``."""
     steps: Int[Array, "*C"]
-    """Until it arrives, for sure; where it leaves what is known, the steps that may be hoped for; ``FAR``
-    where it fails."""
+    """Steps to the goal: exact if it arrives, an optimistic estimate if it leaves the known states, ``FAR``
+    if it fails."""
     rank: Int[Array, "*C"]
-    """The lower, the better. Ties in steps are broken by what was left to go at the best moment, where
-    every step beside a shortest way counts as one more, and then by ``strays``."""
+    """Sort key, lower is better: first ``steps``; then the steps left to the goal at the best moment, where
+    every wasted step counts as one more; then ``strays``."""
     strays: Int[Array, "*C"]
-    """After how many steps it left the shortest ways."""
+    """Number of steps before it first strayed from the shortest paths."""
     farthest: Int[Array, "*C"]
-    """How many steps of a shortest way it had behind it at the best moment."""
+    """Progress at the best moment: how many steps closer to the goal it was than at the start."""
 
 
 def rehearse(world: Seen, policy: Policy, ahead: Ahead, prompts: Prompt) -> Rehearsal:
-    """Try prompts [C] greedily in the table.
+    """Rehearse C prompts with greedy actions.
 
     Args:
-      world: the world as far as it was seen.
-      policy: who acts.
-      ahead: what to try.
+      world: the known part of the world.
+      policy: the policy that acts.
+      ahead: the task.
       prompts: the C prompts.
     """
     greedy = jnp.ones((), bool)
 
-    def tried(prompt: Prompt) -> Rehearsal:
+    def run(prompt: Prompt) -> Rehearsal:
         episode = rollout(jax.random.key(0), world, policy, ahead, Query(prompt, greedy))
         steps = episode.trajectory
-        return _judged(steps.achieved_goals[:, 0].astype(jnp.int32), steps.length, ahead)
+        return _result(steps.achieved_goals[:, 0].astype(jnp.int32), steps.length, ahead)
 
-    return jax.lax.map(tried, prompts, batch_size=TOGETHER)
+    return jax.lax.map(run, prompts, batch_size=TOGETHER)
 
 
-def _judged(way: Int[Array, "T"], length: Int[Array, ""], ahead: Ahead) -> Rehearsal:
-    """What a rehearsal came to that visited the states ``way`` after its start."""
+def _result(way: Int[Array, "T"], length: Int[Array, ""], ahead: Ahead) -> Rehearsal:
+    """The result of a rehearsal that visited the first ``length`` states of ``way`` after its start."""
     states = jnp.concatenate([ahead.start[None], way])
     steps = jnp.arange(len(states))
     known = (steps <= length) & (states != UNKNOWN)
@@ -138,10 +142,10 @@ def _judged(way: Int[Array, "T"], length: Int[Array, ""], ahead: Ahead) -> Rehea
     hoped = last + 1 + left[last] + HOPE
     total = jnp.where(arrives, last, jnp.where(leaves, hoped, FAR))
 
-    beside = steps + left - left[0]  # steps that did not lead nearer
-    to_go = jnp.where(known, left + beside, FAR)
+    wasted = steps + left - left[0]  # steps so far that were not on a shortest path
+    to_go = jnp.where(known, left + wasted, FAR)
     moment = jnp.argmin(to_go)
-    strays = jnp.max(jnp.where(known & (beside == 0), steps, 0))
+    strays = jnp.max(jnp.where(known & (wasted == 0), steps, 0))
     first, second = (jnp.clip(number, 0, _DIGITS - 1) for number in (total, to_go[moment]))
     return Rehearsal(
         ends=jnp.where(arrives, ARRIVES, jnp.where(leaves, LEAVES, FAILS)),
@@ -153,5 +157,5 @@ def _judged(way: Int[Array, "T"], length: Int[Array, ""], ahead: Ahead) -> Rehea
 
 
 def any_of(which: Bool[Array, "C"], rank: Int[Array, "C"]) -> tuple[Array, Array]:
-    """The best of those that are ``which``, and whether there is one."""
+    """The index of the lowest rank among those marked in ``which``, and whether any is marked."""
     return jnp.argmin(jnp.where(which, rank, jnp.iinfo(jnp.int32).max)), jnp.any(which)

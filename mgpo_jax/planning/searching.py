@@ -1,4 +1,4 @@
-"""Search for prompts that lead along a known way, by rehearsing them in the table of what was seen."""
+"""Search for prompts that lead along a known path, by rehearsing them in the table of known states."""
 
 from __future__ import annotations
 
@@ -31,38 +31,40 @@ from mgpo_jax.prompts import Prompt, single_goal
 from mgpo_jax.trees import choose
 
 NUM_PROMPTS = 32
-"""Prompts that are rehearsed together: in each round of changes."""
+"""Number of prompts in the pool, and of mutated prompts that are rehearsed in each round."""
 NUM_KEPT = 20
-"""Of these, those that the next search begins with, beside new random ones."""
+"""Number of the best prompts that the next search starts with, besides new random ones."""
 NUM_PARENTS = 12
-"""The best ones, which are changed."""
+"""Number of the best prompts that are mutated."""
 CROSSED = 0.25
-"""Share of changed prompts that have the goals of two parents."""
+"""Probability that a mutated prompt is first crossed with a second parent."""
 SLACK = 12
-"""A rehearsal is given up when it will take that many steps more than twice the shortest known way."""
+"""A rehearsal may take this many steps more than twice the shortest known path; then it is given up."""
 OF_EACH_END = (6, 10, 10)
-"""How many prompts that arrive, leave what is known, or fail are kept at least, if there are so many."""
+"""Numbers of prompts that arrive, leave the known states, and fail which the pool keeps at least, if it has
+that many."""
 NUM_LED = 8
-"""Prompts that are steered together."""
+"""Number of prompts that are steered together."""
 LENGTHS_LED = (32, 64)
-"""Room for steps of the ways that prompts are steered along; a longer one is not. Less room costs less."""
+"""Capacities, in steps, for a path that prompts are steered along; the smallest sufficient one is used, and
+prompts are not steered along a longer path."""
 
 
 class Features(NamedTuple):
-    """What the plan makes use of; without one of them it is an ablation."""
+    """The parts of the method that are used; turning one off is an ablation."""
 
     rounds: int = 3
-    """Rounds of changed prompts that a search rehearses at most; 0 is no rehearsal at all."""
+    """Largest number of rounds of mutated prompts in a search; 0 disables rehearsals."""
     steering: int = 20
-    """Gradient steps that a search steers prompts by; 0 is none."""
+    """Largest number of gradient steps that steer prompts in a search; 0 disables steering."""
     splice: bool = True
-    """Whether ways are made of all episodes, or of the best one alone."""
+    """Whether paths combine all episodes, rather than come from the best one alone."""
     frontier: bool = True
-    """Whether exploring also heads for frontiers."""
+    """Whether exploration also heads for frontiers."""
 
 
 class Tools(NamedTuple):
-    """What the plan is made with. Everything in it is static, but for the policy's weights."""
+    """The fixed inputs of the method. All of it is static except for the policy's parameters."""
 
     space: SearchSpace
     world: Seen
@@ -71,14 +73,14 @@ class Tools(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What a search leaves for the next one."""
+    """The prompts that a search passes on to the next one."""
 
     kept: Prompt
-    """Its best prompts [NUM_KEPT]."""
+    """The best prompts of the latest search [NUM_KEPT]."""
     led: Prompt
-    """The prompts that it steered [NUM_LED]."""
+    """The prompts that were steered last [NUM_LED]."""
     exists: Bool[Array, ""]
-    """Whether there was a search."""
+    """Whether there was a search yet."""
 
 
 def no_memory(task_goal: Float[Array, "G"], num_slots: int) -> Memory:
@@ -92,59 +94,60 @@ def no_memory(task_goal: Float[Array, "G"], num_slots: int) -> Memory:
 
 
 class Offer(NamedTuple):
-    """The best prompt of one kind that a search has found."""
+    """The best prompt of one kind that a search has found, if there is any."""
 
     prompt: Prompt
     exists: Bool[Array, ""]
 
 
 class Found(NamedTuple):
-    """What a search for prompts has found."""
+    """The result of a search."""
 
     memory: Memory
     sure: Offer
-    """Arrives sooner than any greedy episode before."""
+    """A prompt that reaches the task goal sooner than any greedy episode so far."""
     hopeful: Offer
-    """Leaves what is known, and may arrive sooner."""
+    """A prompt that leaves the known states, and may reach the task goal sooner."""
     num_rehearsed: Int[Array, ""]
+    """Number of prompts that the search rehearsed."""
 
 
 class Pool(NamedTuple):
-    """A search in progress: prompts [NUM_PROMPTS] with their rehearsals, the best first."""
+    """The state of a search: prompts [NUM_PROMPTS] with their rehearsals, best first."""
 
     prompts: Prompt
     rehearsal: Rehearsal
 
 
 def nothing_found(memory: Memory) -> Found:
-    """What is found without a search."""
+    """The result when no search was made."""
     prompt = jax.tree.map(lambda rows: rows[0], memory.kept)
     nothing = Offer(prompt, jnp.zeros((), bool))
     return Found(memory, nothing, nothing, jnp.int32(0))
 
 
 class Quest(NamedTuple):
-    """What a search is for and what it knows."""
+    """The fixed inputs of one search."""
 
     tools: Tools
     table: Table
     way: Way
-    """A shortest known way to the task goal, which is known."""
+    """A shortest known path to the task goal, whose state is in the table."""
     limit: Int[Array, ""]
-    """Steps of the longest way that is of any use."""
+    """Largest number of steps of a rehearsal that would still be useful."""
 
     @property
     def task_goal(self) -> Float[Array, "G"]:
         return self.table.goals[self.way.end]
 
     def tried(self, prompts: Prompt) -> Pool:
-        """Prompts with their rehearsals."""
+        """Rehearse prompts; returns them with the results."""
         way = self.way
         ahead = Ahead(self.table, way.start, way.end, way.left, self.limit)
         return Pool(prompts, rehearse(self.tools.world, self.tools.policy, ahead, prompts))
 
     def changed(self, key: PRNGKeyArray, prompt: Prompt, around: Int[Array, ""]) -> Prompt:
-        """A prompt with one change, see ``proposals.changed``."""
+        """Mutate a prompt, see ``proposals.changed``."""
         longest, stride = self.tools.space.longest, self.table.stride
         return changed(key, prompt, self.way.goals, longest, stride, around)
 
@@ -158,16 +161,16 @@ def search_prompts(
     prompts: Arms,
     verified: Int[Array, ""],
 ) -> Found:
-    """Search for prompts by rehearsing them: the kept ones and random ones, then changed and steered ones.
+    """Search for prompts by rehearsing them: first kept and random prompts, then mutated and steered ones.
 
     Args:
       key: random key.
-      tools: what the plan is made with.
-      table: what is known.
-      way: a shortest known way to the task goal, which is known.
-      memory: what earlier searches have left.
-      prompts: those that were acted with.
-      verified: steps of the shortest greedy episode that arrived.
+      tools: the fixed inputs of the method.
+      table: the map of the task.
+      way: a shortest known path to the task goal, whose state is in the table.
+      memory: the prompts passed on by the last search.
+      prompts: the prompts that were run greedily in episodes.
+      verified: steps of the shortest greedy episode that reached the task goal.
     """
     quest = Quest(tools, table, way, jnp.minimum(verified - 1, 2 * way.steps + SLACK))
     key_random, key_rounds, key_led = jax.random.split(key, 3)
@@ -175,18 +178,18 @@ def search_prompts(
     fresh = random_prompts(
         key_random, way.goals, quest.task_goal, space.num_slots, space.longest, NUM_PROMPTS
     )
-    pool = _best(quest.tried(_begun(memory, fresh)))
+    pool = _best(quest.tried(_first_prompts(memory, fresh)))
 
-    def goes_on(carry: tuple[Array, Pool]) -> Bool[Array, ""]:
+    def unfinished(carry: tuple[Array, Pool]) -> Bool[Array, ""]:
         return (carry[0] < tools.features.rounds) & ~_has_shortest(carry[1], way.steps)
 
     def change(carry: tuple[Array, Pool]) -> tuple[Array, Pool]:
         index, pool = carry
         keys = jax.random.split(jax.random.fold_in(key_rounds, index), NUM_PROMPTS)
         children = jax.vmap(lambda key: _child(key, quest, pool))(keys)
-        return index + 1, _best(_joined(pool, quest.tried(children)))
+        return index + 1, _best(_concatenated(pool, quest.tried(children)))
 
-    num_rounds, pool = jax.lax.while_loop(goes_on, change, (jnp.int32(0), pool))
+    num_rounds, pool = jax.lax.while_loop(unfinished, change, (jnp.int32(0), pool))
     num, led = NUM_PROMPTS * (1 + num_rounds), memory.led
     if tools.features.steering and tools.policy.score is not None:
         lengths = sorted({min(length, space.horizon) for length in LENGTHS_LED})
@@ -200,7 +203,7 @@ def search_prompts(
         pool, led = jax.lax.switch(which, branches, pool)
         num += NUM_LED * needed
     sooner = pool.rehearsal.steps < verified
-    if space.deterministic:  # what a prompt did once it would do again
+    if space.deterministic:  # a prompt that was run before would act the same again
         sooner &= ~jax.vmap(partial(is_tried, prompts))(pool.prompts)
     return Found(
         memory=Memory(_rows(pool.prompts, NUM_KEPT), led, jnp.ones((), bool)),
@@ -210,8 +213,8 @@ def search_prompts(
     )
 
 
-def _begun(memory: Memory, fresh: Prompt) -> Prompt:
-    """What a search begins with: the kept prompts and random ones, or random ones alone."""
+def _first_prompts(memory: Memory, fresh: Prompt) -> Prompt:
+    """The prompts [NUM_PROMPTS] that a search starts with: kept ones, if there are any, and random ones."""
     keeps = memory.exists & (jnp.arange(NUM_PROMPTS) < NUM_KEPT)
     return jax.tree.map(
         lambda old, new: jnp.where(
@@ -225,12 +228,13 @@ def _begun(memory: Memory, fresh: Prompt) -> Prompt:
 
 
 def _has_shortest(pool: Pool, known: Int[Array, ""]) -> Bool[Array, ""]:
-    """Whether the best prompt surely takes a shortest known way."""
+    """Whether the best prompt certainly reaches the task goal by a path no longer than the shortest known
+    one."""
     return (pool.rehearsal.ends[0] == ARRIVES) & (pool.rehearsal.steps[0] <= known)
 
 
 def _child(key: PRNGKeyArray, quest: Quest, pool: Pool) -> Prompt:
-    """A changed prompt of one of the best, at times with goals of another one."""
+    """Mutate one of the best prompts once or twice, sometimes after crossing it with another one."""
     key_parent, key_cross, key_crosses, key_where, key_change = jax.random.split(key, 5)
     first, second = jax.random.randint(key_parent, (2,), 0, NUM_PARENTS)
     parent, mate = (jax.tree.map(lambda rows, i=i: rows[i], pool.prompts) for i in (first, second))
@@ -248,50 +252,57 @@ def _child(key: PRNGKeyArray, quest: Quest, pool: Pool) -> Prompt:
 def _steered(
     key: PRNGKeyArray, quest: Quest, fresh: Prompt, led: Prompt, longest: int, pool: Pool
 ) -> tuple[Pool, Prompt]:
-    """The pool with steered prompts, and these: of those led before, changed ones, good and random ones.
+    """Steer the most promising prompts along the known path and add them to the pool.
 
-    There is room for ways of ``longest`` steps.
+    Candidates are the prompts that were steered last (``led``), mutations of them, the best ones of the
+    pool and random ones (``fresh``); those of the smallest deficits are steered. The path may have up to
+    ``longest`` steps.
+
+    Returns:
+      The new pool, and the steered prompts [NUM_LED].
     """
     way = quest.way
     lead = lead_along(quest.table, way.start, way.states, longest)
     tools, stride = quest.tools, quest.table.stride
     change = lambda key, prompt: quest.changed(key, prompt, pool.rehearsal.strays[0])  # noqa: E731
     own = jax.vmap(change)(jax.random.split(key, NUM_LED), led)
-    first = _joined(led, own, _rows(pool.prompts, NUM_LED), _rows(fresh, NUM_LED))
+    first = _concatenated(led, own, _rows(pool.prompts, NUM_LED), _rows(fresh, NUM_LED))
     chosen = jnp.argsort(deficits(tools.policy, lead, first))[:NUM_LED]
     first = jax.tree.map(lambda rows: rows[chosen], first)
     moved, _ = steer(tools.policy, lead, first, stride, tools.features.steering)
-    return _best(_joined(pool, quest.tried(moved))), moved
+    return _best(_concatenated(pool, quest.tried(moved))), moved
 
 
-def _joined(*trees: Any) -> Any:
-    """The rows of several pytrees one after another."""
+def _concatenated(*trees: Any) -> Any:
+    """Concatenate the rows of pytrees."""
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *trees)
 
 
 def _rows(tree: Any, num: int) -> Any:
-    """The first rows of a pytree."""
+    """The first ``num`` rows of a pytree."""
     return jax.tree.map(lambda rows: rows[:num], tree)
 
 
 def _offer(pool: Pool, which: Bool[Array, "C"]) -> Offer:
+    """The best prompt of a pool among those marked in ``which``."""
     index, exists = any_of(which, pool.rehearsal.rank)
     prompt = jax.tree.map(lambda rows: rows[index], pool.prompts)
     return Offer(prompt, exists)
 
 
 def _best(pool: Pool) -> Pool:
-    """The ``NUM_PROMPTS`` best of a pool, each once, with some of each end, the best first."""
+    """The ``NUM_PROMPTS`` best prompts of a pool, best first, without duplicates and with some of each
+    end."""
     rehearsal = pool.rehearsal
     num = len(rehearsal.rank)
-    # Prompts of the same rank do the same, as far as it matters.
+    # Prompts of the same rank count as duplicates.
     again = jnp.any(jnp.tril(rehearsal.rank[:, None] == rehearsal.rank, -1), axis=-1)
     order = jnp.argsort(jnp.where(again, jnp.iinfo(jnp.int32).max, rehearsal.rank))
     pool = jax.tree.map(lambda rows: rows[order], pool)
     ends, again = pool.rehearsal.ends, again[order]
     is_end = ends[:, None] == jnp.array([ARRIVES, LEAVES, FAILS])
-    place = jnp.cumsum(is_end, axis=0)[jnp.arange(num), ends]  # among those of its end
+    place = jnp.cumsum(is_end, axis=0)[jnp.arange(num), ends]  # among those of the same end
     spare = again | (place > jnp.array(OF_EACH_END)[ends])
-    # The order among those that stay is kept, since the sort is stable.
+    # The sort is stable, so the selected prompts stay in order.
     chosen = jnp.sort(jnp.argsort(spare)[:NUM_PROMPTS])
     return jax.tree.map(lambda rows: rows[chosen], pool)

@@ -1,9 +1,9 @@
-"""How a prompt has to change so that the frozen policy takes a known way.
+"""Steering: gradient steps on the goals of a prompt so that the frozen policy takes a known path.
 
-A policy that is led along a way, its observations and actions given, says at each step which action it
-would rather take. By how much it prefers that one, in log probabilities and summed over the way, is the
-prompt's *deficit*: it is 0 where the policy takes the way by itself. The goals of a prompt are numbers, so
-the deficit has a gradient.
+The policy is teacher-forced along the path, and at each step its most likely action is compared with the
+action of the path. The difference of their log probabilities, summed over the path, is the prompt's
+*deficit*. It is 0 if the policy takes the path by itself. The goals of a prompt are continuous, so the
+deficit has a gradient with respect to them.
 """
 
 from __future__ import annotations
@@ -20,22 +20,26 @@ from mgpo_jax.policy import Policy
 from mgpo_jax.prompts import Prompt
 
 RATE = 0.15
-"""Learning rate of Adam, in units of how far a step changes a goal."""
+"""Learning rate of Adam, in units of the change of the goal in one step (``Table.stride``)."""
 LIKELIER = 0.05
-"""Weight of the way's own log likelihood beside the deficit, which keeps its actions ahead of others."""
+"""Weight in the loss of the log-likelihood of the path's actions, which keeps them ahead of other
+actions."""
 
 
 class Lead(NamedTuple):
-    """A known way of at most L steps as the policy sees it when it takes it."""
+    """A known path of at most L steps, as the observations and actions of the policy on it."""
 
     obs: Shaped[Array, "L ..."]
     actions: Int[Array, "L"]
     real: Bool[Array, "L"]
-    """Which steps there are."""
+    """Which steps are real, not padding."""
 
 
 def lead_along(table: Table, start: Int[Array, ""], way: Int[Array, "T"], longest: int) -> Lead:
-    """A way, given by the states after ``start``, as the policy sees it; cut off after so many steps."""
+    """The observations and actions on a path, which is given by the states after ``start``.
+
+    A path of more than ``longest`` (L) steps is cut off.
+    """
     missing = jnp.full(max(longest - len(way), 0), UNKNOWN)
     states = jnp.concatenate([start[None], way, missing])
     before, after = states[:longest], states[1 : longest + 1]
@@ -46,7 +50,7 @@ def lead_along(table: Table, start: Int[Array, ""], way: Int[Array, "T"], longes
 def deficit_and_loss(
     policy: Policy, lead: Lead, prompt: Prompt
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """The deficit of a prompt, and what its gradient is taken of."""
+    """The deficit of a prompt, and the loss whose gradient steers it."""
     if policy.score is None:
         raise ValueError("this policy tells no likelihoods (its field score is None)")
     distribution = policy.score(prompt, lead.obs, lead.actions)
@@ -58,38 +62,38 @@ def deficit_and_loss(
 
 
 def deficits(policy: Policy, lead: Lead, prompts: Prompt) -> Float[Array, "C"]:
-    """The deficits of prompts [C]."""
+    """The deficits of C prompts."""
     return jax.lax.map(
         lambda prompt: deficit_and_loss(policy, lead, prompt)[0], prompts, batch_size=8
     )
 
 
 class _Steering(NamedTuple):
-    """Gradient steps in progress, for Q prompts."""
+    """The state of the optimization of Q prompts."""
 
     steps: Int[Array, ""]
     goals: Float[Array, "Q P G"]
     moments: Any
     best: Float[Array, "Q P G"]
-    """The goals of the smallest deficit so far."""
+    """The goals with the smallest deficit so far."""
     deficit: Float[Array, "Q"]
-    """That deficit."""
+    """The smallest deficit so far."""
 
 
 def steer(
     policy: Policy, lead: Lead, prompts: Prompt, stride: Float[Array, ""], num_steps: int
 ) -> tuple[Prompt, Float[Array, "Q"]]:
-    """Move the goals of prompts [Q] down the gradient of their deficits; the last goals stay.
+    """Optimize the goals of Q prompts, except for their last ones, by Adam (``deficit_and_loss``).
 
     Args:
-      policy: who is to take the way. It must tell all its distributions at once (``Policy.score``).
-      lead: the way.
-      prompts: where to start.
-      stride: how far a step changes a goal.
-      num_steps: gradient steps at most. It ends sooner when a prompt has no deficit any more.
+      policy: the policy that is to take the path. It must provide ``Policy.score``.
+      lead: the path.
+      prompts: the initial prompts.
+      stride: the change of the goal in one step, which scales the learning rate.
+      num_steps: largest number of gradient steps. The loop ends sooner once any prompt has no deficit.
 
     Returns:
-      The prompts of the smallest deficits on the way down, and these.
+      For each prompt the version with the smallest deficit, and that deficit.
     """
     optimizer = optax.adam(RATE)  # in units of the stride
     movable = prompts.mask.at[:, -1].set(False)[..., None]

@@ -1,8 +1,8 @@
-"""What was seen of one task, as a table of states: its map.
+"""The map of one task: a table of the states seen so far and of the transitions between them.
 
-A state is known by the goal that is reached in it, in worlds where a goal says so much
-(``EnvSpec.goals_are_states``). The table has room for a fixed number of states; when it is full, further
-states are not kept, and what leads to them counts as unknown. All functions are for one task.
+A state is identified by the goal that is reached in it, in worlds where goals determine states
+(``EnvSpec.goals_are_states``). The table has a fixed capacity. Once it is full, further states are ignored,
+and actions that lead to them count as unknown. All functions are for one task.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, Shaped
 from envs.base import EnvSpec, Episode, Goals
 
 UNKNOWN = -1
-"""Where it is not known what an action leads to, and after the end of a way."""
+"""Index of an unknown state: the result of an untried action, and the padding after the end of a path."""
 FAR = 1_000_000
-"""Steps to a state to which no known way leads."""
+"""Number of steps to a state that no known path leads to."""
 SAME = 1e-4  # goals that differ by less are the same state
 
 
 class Table(NamedTuple):
-    """N rows for states, of which the first ``size`` are taken."""
+    """A table of N rows for states, of which the first ``size`` are in use."""
 
     goals: Float[Array, "N G"]
     """The goal that is reached in each state."""
     obs: Shaped[Array, "N ..."]
-    """What the agent sees there, as it was when it was there first."""
+    """The observation in each state, from the first visit."""
     successors: Int[Array, "N A"]
-    """The state that each action led to the last time; ``UNKNOWN`` where it was not tried."""
+    """The state that each action led to when it was last taken; ``UNKNOWN`` if it was never taken."""
     visits: Int[Array, "N"]
-    """How often episodes were there."""
+    """Number of visits to each state."""
     size: Int[Array, ""]
     stride: Float[Array, ""]
     """The largest change of the goal in one step so far, as a sum over its components."""
@@ -52,20 +52,20 @@ def empty_table(spec: EnvSpec, num_states: int) -> Table:
 
 
 def forgotten(table: Table) -> Table:
-    """A table of the same room without any state."""
+    """An empty table with the same shapes."""
     blank = jax.tree.map(jnp.zeros_like, table)
     return blank._replace(successors=jnp.full_like(table.successors, UNKNOWN))
 
 
 def find_state(table: Table, goal: Float[Array, "G"]) -> Int[Array, ""]:
-    """The state in which a goal is reached; ``UNKNOWN`` if it was not seen."""
+    """The state in which a goal is reached; ``UNKNOWN`` if it is not in the table."""
     near = jnp.max(jnp.abs(table.goals - goal), axis=-1) < SAME
     near &= jnp.arange(len(table.goals)) < table.size
     return jnp.where(jnp.any(near), jnp.argmax(near), UNKNOWN)
 
 
 def add_episode(table: Table, episode: Episode) -> tuple[Table, Int[Array, ""]]:
-    """The table with all steps of an episode, and the state in which it started."""
+    """Add all steps of an episode to the table; also returns the state in which it started."""
     steps = episode.trajectory
 
     def visit(table: Table, goal: Array, obs: Array) -> tuple[Table, Int[Array, ""]]:
@@ -99,40 +99,41 @@ def add_episode(table: Table, episode: Episode) -> tuple[Table, Int[Array, ""]]:
 
 
 def steps_to(table: Table, state: Int[Array, ""]) -> Int[Array, "N"]:
-    """The fewest known steps from each state to one of them; ``FAR`` where no way is known.
+    """The length of the shortest known path from each state to ``state``; ``FAR`` if there is none.
 
-    ``UNKNOWN`` is a state that no way leads to.
+    If ``state`` is ``UNKNOWN``, no path leads to it.
     """
 
     def relax(distance: Array) -> Array:
         after = jnp.where(table.successors == UNKNOWN, FAR, distance[table.successors])
         return jnp.minimum(distance, 1 + jnp.min(after, axis=-1)).clip(max=FAR)
 
-    return _settled(relax, _nowhere(table).at[_or_none(table, state)].set(0, mode="drop"))
+    return _fixed_point(relax, _all_far(table).at[_row_or_none(table, state)].set(0, mode="drop"))
 
 
 def steps_from(table: Table, state: Int[Array, ""]) -> Int[Array, "N"]:
-    """The fewest known steps from one state to each; ``FAR`` where no way is known."""
+    """The length of the shortest known path from ``state`` to each state; ``FAR`` if there is none."""
     to = jnp.where(table.successors == UNKNOWN, len(table.goals), table.successors)
 
     def relax(distance: Array) -> Array:
         reached = jnp.broadcast_to(1 + distance[:, None], to.shape)
         return distance.at[to].min(reached, mode="drop")
 
-    return _settled(relax, _nowhere(table).at[_or_none(table, state)].set(0, mode="drop"))
+    return _fixed_point(relax, _all_far(table).at[_row_or_none(table, state)].set(0, mode="drop"))
 
 
-def _nowhere(table: Table) -> Int[Array, "N"]:
+def _all_far(table: Table) -> Int[Array, "N"]:
+    """The distance ``FAR`` for every state."""
     return jnp.full(len(table.goals), FAR)
 
 
-def _or_none(table: Table, state: Int[Array, ""]) -> Int[Array, ""]:
-    """A row to write to, or one that does not exist."""
+def _row_or_none(table: Table, state: Int[Array, ""]) -> Int[Array, ""]:
+    """The row of a state; for ``UNKNOWN`` one past the end, to which writes are dropped."""
     return jnp.where(state == UNKNOWN, len(table.goals), state)
 
 
-def _settled(relax: Callable[[Array], Array], distance: Int[Array, "N"]) -> Int[Array, "N"]:
-    """Distances that ``relax`` changes no further."""
+def _fixed_point(relax: Callable[[Array], Array], distance: Int[Array, "N"]) -> Int[Array, "N"]:
+    """Apply ``relax`` until it changes no distance any more."""
     first = (distance, jnp.ones((), bool))
 
     def again(carry: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -149,60 +150,61 @@ def shortest_way(
     left: Int[Array, "N"],
     longest: int,
 ) -> Int[Array, "L"]:
-    """The states after ``start`` on a shortest known way, a random one of several.
+    """The states after ``start`` on a shortest known path; if there are several, on a random one.
 
     Args:
       key: random key.
-      table: what is known.
-      start: where the way starts.
-      left: ``steps_to`` the state where it ends.
-      longest: L, the room for the way. One that is longer is cut off.
+      table: the map of the task.
+      start: the state in which the path starts.
+      left: ``steps_to`` the state in which the path ends.
+      longest: L, the capacity for the path in steps. A longer path is cut off.
 
     Returns:
-      The states, followed by ``UNKNOWN``.
+      The indices of the states, followed by ``UNKNOWN``.
     """
 
     def walk(state: Array, key: PRNGKeyArray) -> tuple[Array, Array]:
         after = table.successors[state]
         closer = (after != UNKNOWN) & (left[after] < left[state]) & (left[state] < FAR)
         pick = jnp.argmax(jnp.where(closer, jax.random.uniform(key, after.shape), -1.0))
-        goes_on = (state != UNKNOWN) & jnp.any(closer)
-        state = jnp.where(goes_on, after[pick], UNKNOWN)
+        has_next = (state != UNKNOWN) & jnp.any(closer)
+        state = jnp.where(has_next, after[pick], UNKNOWN)
         return state, state
 
     return jax.lax.scan(walk, start, jax.random.split(key, longest))[1]
 
 
 class Way(NamedTuple):
-    """A shortest known way from a state to another one."""
+    """A shortest known path from one state to another."""
 
     start: Int[Array, ""]
     end: Int[Array, ""]
-    """``UNKNOWN`` for a state that was not seen."""
+    """The state at the end; ``UNKNOWN`` for one that is not in the table."""
     left: Int[Array, "N"]
-    """``steps_to`` its end."""
+    """The number of known steps from each state to the end (``steps_to``)."""
     states: Int[Array, "L"]
     """The states after ``start``, followed by ``UNKNOWN``."""
     goals: Goals
-    """The goals that are reached on it, its end included."""
+    """The goals that are reached on the path, including the one at its end."""
 
     @property
     def steps(self) -> Int[Array, ""]:
-        """How many steps it takes; ``FAR`` if no way is known."""
+        """The number of steps of the path; ``FAR`` if no path is known."""
         return jnp.where(self.end == UNKNOWN, FAR, self.left[self.start])
 
 
 def way_to(
     key: PRNGKeyArray, table: Table, start: Int[Array, ""], end: Int[Array, ""], longest: int
 ) -> Way:
-    """A shortest known way between two states, a random one of several; see ``shortest_way``."""
+    """A shortest known path between two states; if there are several, a random one (``shortest_way``)."""
     left = steps_to(table, end)
     states = shortest_way(key, table, start, left, longest)
     return Way(start, end, left, states, goals_on(table, states))
 
 
 def goals_on(table: Table, way: Int[Array, "L"]) -> Goals:
-    """The goals that are reached on a way, its end included, in the form that prompts are drawn from."""
+    """The goals that are reached on a path, including its end, as a record that prompts can be drawn
+    from."""
     on_way = way != UNKNOWN
     goals = jnp.where(on_way[:, None], table.goals[way], 0.0)
     return Goals(goals, on_way, goals, on_way.sum())

@@ -1,4 +1,5 @@
-"""The prompts that a plan has acted with greedily, and their returns, in the bandits' table of arms."""
+"""The prompts that ``plan`` has run greedily, with their returns, in the same table of arms as the
+bandits'."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from mgpo_jax.trees import choose
 
 
 def equal_to(prompts: Arms, prompt: Prompt) -> Bool[Array, "M"]:
-    """Which prompts of the table are this one."""
+    """Which rows of the table hold this prompt."""
     same = jnp.all(prompts.prompts.goals == prompt.goals, axis=(1, 2))
     return same & jnp.all(prompts.prompts.mask == prompt.mask, axis=1) & prompts.taken
 
@@ -23,7 +24,7 @@ def is_tried(prompts: Arms, prompt: Prompt) -> Bool[Array, ""]:
 
 
 def with_result(prompts: Arms, query: Query, return_: Float[Array, ""]) -> Arms:
-    """The table after an episode. One that did not act greedily changes nothing."""
+    """The table with the return of an episode, if the episode was greedy."""
     same = equal_to(prompts, query.prompt)
     updated = update_arm(prompts, jnp.argmax(same), return_)
     told = choose(jnp.any(same), updated, insert_arm(prompts, query.prompt, return_))

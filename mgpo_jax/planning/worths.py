@@ -1,11 +1,12 @@
-"""The plan where nothing is certain: an estimate of what goals, and orders of two goals, are worth.
+"""``plan`` in all other worlds: a Gaussian process that predicts the mean return of a prompt.
 
-In some worlds a goal reached says neither in which state the world is nor whether it was the right one, and
-returns differ from episode to episode under the same prompt. What can be learned there is how the mean
-return depends on the prompt. The model is a Gaussian process over prompts: two prompts are alike as far as
-they share goals, and pairs of goals in the same order, where goals are alike as far as they are near each
-other. Prompts are drawn from the best trajectory so far, and that one is tried of which a draw from the
-posterior is highest (Thompson sampling). The best prompt is the tried one of the highest posterior mean.
+In these worlds a reached goal tells neither the state of the world nor whether it was the right goal, and
+the returns of one prompt vary between episodes. What can be learned is how the mean return depends on the
+prompt. The kernel of the Gaussian process compares the goals that two prompts share, and the pairs of goals
+that they share in the same order; two goals count as shared to the degree that they are near each other.
+Candidates are drawn from the best trajectory so far, and the one with the highest draw from the posterior
+is run (Thompson sampling). The best prompt is the one with the highest posterior mean among those that were
+run.
 """
 
 from __future__ import annotations
@@ -26,17 +27,17 @@ from mgpo_jax.rollout import Query
 from mgpo_jax.trees import choose, put_row
 
 NUM_CANDIDATES = 16
-"""New prompts that are compared in an episode."""
+"""Number of candidate prompts in each episode."""
 NEAR = 0.5
-"""Distance of two goals at which they begin to differ."""
+"""Length scale of the similarity of two goals, in units of goals."""
 SHARE_OF_PAIRS = 0.5
-"""How much of the likeness of two prompts is that of their orders."""
+"""Weight of shared pairs of goals in the kernel; the rest is the weight of shared goals."""
 SHARE_OF_PROMPT = 0.3
-"""Standard deviation of mean returns between prompts, in units of that of returns between episodes."""
+"""Prior standard deviation of the mean returns of prompts, relative to that of the returns of episodes."""
 
 
 def alike(prompt: Prompt, other: Prompt) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """How many goals, and how many pairs of goals in the same order, two prompts share."""
+    """The (soft) number of goals, and of pairs of goals in the same order, that two prompts share."""
     both = prompt.mask[:, None] & other.mask
     apart = jnp.sum((prompt.goals[:, None] - other.goals) ** 2, axis=-1)
     same = jnp.where(both, jnp.exp(-apart / (2 * NEAR**2)), 0.0)
@@ -46,25 +47,26 @@ def alike(prompt: Prompt, other: Prompt) -> tuple[Float[Array, ""], Float[Array,
 
 
 def likeness(prompt: Prompt, other: Prompt) -> Float[Array, ""]:
-    """The kernel of the Gaussian process: 1 for a prompt and itself."""
+    """The kernel of the Gaussian process, in [0, 1]; it is 1 for two equal prompts."""
 
     def share(index: int) -> Array:
         own, others = alike(prompt, prompt)[index], alike(other, other)[index]
         shared = alike(prompt, other)[index] / jnp.sqrt(jnp.maximum(own * others, 1e-12))
-        return jnp.where((own == 0) & (others == 0), 1.0, shared)  # no pairs in either
+        return jnp.where((own == 0) & (others == 0), 1.0, shared)  # neither has any pair
 
     return (1 - SHARE_OF_PAIRS) * share(0) + SHARE_OF_PAIRS * share(1)
 
 
 class WorthState(NamedTuple):
-    """The plan between two episodes, with room for N of them."""
+    """The state of the optimizer between two episodes, with room for N episodes."""
 
     task_goal: Float[Array, "G"]
     prompts: Prompt
-    """The prompts that were acted with [N]."""
+    """The prompt of each episode [N]."""
     returns: Float[Array, "N"]
+    """The return of each episode."""
     kernel: Float[Array, "N N"]
-    """Likeness of these prompts."""
+    """The kernel matrix of the prompts (``likeness``)."""
     size: Int[Array, ""]
     best_return: Float[Array, ""]
     best_goals: Goals
@@ -72,14 +74,15 @@ class WorthState(NamedTuple):
 
 
 class Posterior(NamedTuple):
-    """What is known of the mean returns of some prompts."""
+    """The posterior over the mean returns of C prompts."""
 
     mean: Float[Array, "C"]
     std: Float[Array, "C"]
 
 
 def posterior(state: WorthState, rows: Float[Array, "C N"]) -> Posterior:
-    """The posterior of prompts whose likeness to those that were acted with is ``rows``."""
+    """The posterior for C prompts, given the kernel values between them and the prompts of the N
+    episodes."""
     taken = jnp.arange(len(state.returns)) < state.size
     num = jnp.maximum(state.size, 1)
     center = jnp.sum(jnp.where(taken, state.returns, 0.0)) / num
@@ -97,7 +100,7 @@ def posterior(state: WorthState, rows: Float[Array, "C N"]) -> Posterior:
 
 
 def plan_worth(space: SearchSpace) -> PromptOptimizer:
-    """The plan in a world of which nothing is certain."""
+    """The optimizer ``plan`` for a world whose goals are no states and whose rewards confirm no goals."""
 
     def init(key: PRNGKeyArray, task_goal: Float[Array, "G"]) -> WorthState:
         del key
@@ -113,7 +116,7 @@ def plan_worth(space: SearchSpace) -> PromptOptimizer:
         )
 
     def best(state: WorthState) -> Prompt:
-        # Where a prompt's return is always the same, there is nothing to estimate.
+        # In deterministic worlds the return of a prompt is known exactly after one episode.
         worth = state.returns if space.deterministic else posterior(state, state.kernel).mean
         taken = jnp.arange(len(state.returns)) < state.size
         index = jnp.argmax(jnp.where(taken, worth, -jnp.inf))
@@ -124,13 +127,14 @@ def plan_worth(space: SearchSpace) -> PromptOptimizer:
 
 
 def _ask(space: SearchSpace, key: PRNGKeyArray, state: WorthState) -> tuple[Query, WorthState]:
-    """The drawn prompt of the highest draw from the posterior; at first (g^M), greedily."""
+    """Choose the candidate with the highest draw from the posterior; the first episode runs (g^M)
+    greedily."""
     key_prompt, key_draw = jax.random.split(key)
     slots, longest = space.num_slots, space.longest
     drawn = random_prompts(
         key_prompt, state.best_goals, state.task_goal, slots, longest, NUM_CANDIDATES
     )
-    found = posterior(state, jax.vmap(partial(_to_all, state))(drawn))
+    found = posterior(state, jax.vmap(partial(_kernel_row, state))(drawn))
     values = found.mean + found.std * jax.random.normal(key_draw, found.mean.shape)
     chosen = jax.tree.map(lambda rows: rows[jnp.argmax(values)], drawn)
     begins = state.size == 0
@@ -138,25 +142,25 @@ def _ask(space: SearchSpace, key: PRNGKeyArray, state: WorthState) -> tuple[Quer
     return Query(prompt, begins | space.deterministic), state
 
 
-def _to_all(state: WorthState, prompt: Prompt) -> Float[Array, "N"]:
-    """How like a prompt is to each of those that were acted with."""
+def _kernel_row(state: WorthState, prompt: Prompt) -> Float[Array, "N"]:
+    """The kernel values between a prompt and the prompts of all episodes."""
     return jax.vmap(partial(likeness, prompt))(state.prompts)
 
 
 def _tell(state: WorthState, query: Query, episode: Episode) -> WorthState:
-    """The state with the result of an episode; once it is full, the last one is replaced."""
+    """Add an episode to the state; once the state is full, the newest episode replaces the last one."""
     num = len(state.returns)
     row = jnp.minimum(state.size, num - 1)
-    told = state._replace(
+    added = state._replace(
         prompts=put_row(state.prompts, query.prompt, row),
         returns=state.returns.at[row].set(episode.return_),
         size=jnp.minimum(state.size + 1, num),
     )
-    to_others = _to_all(told, query.prompt)
+    row_values = _kernel_row(added, query.prompt)
     improves = episode.return_ >= state.best_return
     goals = until_reached(episode.trajectory.goals, state.task_goal)
-    return told._replace(
-        kernel=told.kernel.at[row].set(to_others).at[:, row].set(to_others),
+    return added._replace(
+        kernel=added.kernel.at[row].set(row_values).at[:, row].set(row_values),
         best_return=jnp.maximum(episode.return_, state.best_return),
         best_goals=choose(improves, goals, state.best_goals),
     )
