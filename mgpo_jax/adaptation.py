@@ -190,18 +190,17 @@ def proceed(
     """
     judge_keys = None if judge_key is None else jax.random.split(judge_key, num_judged)
 
-    @jax.jit  # so that the shapes of the log and the loop below share one trace
     def entry(state: AdaptState, index: Array) -> tuple[AdaptState, AdaptLog]:
         searching = jnp.ones((), bool) if judge_keys is None else index < num_rounds
         own_key = None if judge_keys is None else judge_keys[jnp.maximum(index - num_rounds, 0)]
         return _round(state, env, adapter, task, searching, own_key, keep_actions, stopped)
 
-    shapes = jax.eval_shape(entry, state, jnp.int32(0))[1]
+    traced, (_, shapes) = traced_once(entry, state, jnp.int32(0))
     size = max_rounds + num_judged
     blank = jax.tree.map(lambda leaf: _zeros((size, *leaf.shape), leaf.dtype), shapes)
 
     def body(index: Array, carry: tuple[AdaptState, AdaptLog]) -> tuple[AdaptState, AdaptLog]:
-        state, row = entry(carry[0], index)
+        state, row = traced(carry[0], index)
         return state, put_row(carry[1], row, index)
 
     state, log = jax.lax.fori_loop(0, num_rounds + num_judged, body, (state, blank))
@@ -276,6 +275,21 @@ def idle_when(stopped: Bool[Array, ""], agent: Agent) -> Agent:
         return action, quits | stopped, memory
 
     return agent._replace(begin=begin)
+
+
+def traced_once(function: Callable, *args: Any) -> tuple[Callable, Any]:
+    """The same function, not to be traced again for these shapes, and the shapes of its results.
+
+    Tracing is most of what starting a program from the cache costs, and jax forgets it between a question
+    for shapes and a loop.
+    """
+    closed, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
+
+    def call(*args: Any) -> Any:
+        leaves = jax.core.eval_jaxpr(closed.jaxpr, closed.consts, *jax.tree.leaves(args))
+        return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
+
+    return call, shapes
 
 
 def in_turn(function: Callable) -> Callable:
