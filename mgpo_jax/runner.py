@@ -120,7 +120,7 @@ def sweep(
     journal: Journal | None = None,
     begin: Callable[[], object] = lambda: None,
 ) -> list[Outcome]:
-    """Adapt with several variants of a method's hyper-parameters in one compiled program.
+    """Adapt in one compiled program; returns an outcome for each variant of the hyper-parameters.
 
     Args:
       env: the world.
@@ -139,12 +139,8 @@ def sweep(
       journal: saves finished segments; segments that it already holds are not run again.
       begin: called once, after all checks and before anything is compiled.
 
-    Returns:
-      One outcome for each variant.
-
     Raises:
-      UsageError: if a number is below 1, there are no tasks, the results do not fit into memory, or the
-        method cannot be used in this setting.
+      UsageError: for a number below 1, no tasks, results that exceed the memory, or an unsuitable method.
       DataError: if the policy was trained for another world, or a return is not finite.
     """
     _check_positive(seeds=seeds, episodes=episodes, eval_every=eval_every)
