@@ -41,7 +41,8 @@ def run(tmp_path: Path) -> Path:
     save_policy(tmp_path / "run" / "policy", config, params, made)
     rows = "".join(json.dumps({"step": step, **ROW}) + "\n" for step in (2, 4))
     (tmp_path / "run" / "metrics.jsonl").write_text(rows)
-    meta = {"command": ["python", "-m", "experiments.pretrain"], "revision": "x"}
+    command = "python -m experiments.pretrain --out /tmp/a --steps 4 --out=b"
+    meta = {"command": command.split(), "revision": "x"}
     (tmp_path / "run" / "meta.json").write_text(json.dumps(meta))
     (tmp_path / "run" / "training.png").touch()
     return tmp_path / "run"
@@ -71,7 +72,7 @@ def test_a_run_is_packed(run: Path, release: Release) -> None:
     world = envs.find("gridworld")
     assert num_tasks(load_tasks(packed / "tasks.npz", world.make())) == world.num_test_tasks
     assert load_policy(world, packed).made["steps"] == 4
-    assert "python -m experiments.pretrain" in (packed / "README.md").read_text()
+    assert "\n    python -m experiments.pretrain --steps 4\n" in (packed / "README.md").read_text()
     assert not list(run.parent.glob("*.partial"))
 
 

@@ -112,8 +112,19 @@ def read_run(source: Path, env: str | None = None) -> Finished:
     rows = read_metrics(source / METRICS, METRICS_SHOWN)
     meta = read_meta(source / "meta.json", RESUME)
     variants = variant_counts(Path(meta.dataset), meta.dataset_sha256) if meta.dataset else {}
-    command = " ".join(meta.command) or "(not known)"
+    command = " ".join(_without_out(meta.command)) or "(not known)"
     return Finished(source, world, policy, config, rows, command, variants)
+
+
+def _without_out(command: Sequence[str]) -> list[str]:
+    """A command without ``--out FOLDER``, which says nothing about the policy."""
+    shown, words = [], iter(command)
+    for word in words:
+        if word == "--out":
+            next(words, None)
+        elif not word.startswith("--out="):
+            shown.append(word)
+    return shown
 
 
 def cpu_minutes(rows: Sequence[dict[str, Any]]) -> float:
