@@ -64,9 +64,9 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
 
 def test_baselines_without_a_released_network_start_from_random_weights() -> None:
     """And what a world cannot have, such as a method whose check refuses it, has no row."""
-    world, env = envs.find("maze15"), envs.make("maze15")
+    world, env = envs.find("maze30"), envs.make("maze30")
     dataset, _ = measurements.bench_collect(world, env, "astar2", 8)
-    recipe = pretrain_preset("maze15", "smoke", "spirl")
+    recipe = pretrain_preset("maze30", "smoke", "spirl")
     policy, note = measurements.policy_to_bench(world, env, recipe, dataset)
     assert note == "untrained policy"
     assert kind_of(policy.config).name == "spirl"

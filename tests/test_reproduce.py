@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -333,17 +334,19 @@ def test_all_has_the_worlds_of_the_paper() -> None:
 
 
 def test_the_inventory_counts_prices_and_doubts(tmp_path: Path) -> None:
-    config = ReproduceConfig(what="list", env=("maze15",), out=tmp_path)
-    rows = {
-        row[0]: row[1:]
-        for line in inventory.inventory(config).splitlines()[2:]
-        for row in [[cell.strip() for cell in line.strip("|").split("|")]]
-    }
+    def rows_of(world: str) -> dict[str, list[str]]:
+        config = ReproduceConfig(what="list", env=(world,), out=tmp_path)
+        lines = inventory.inventory(config).splitlines()[2:]
+        cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+        return {row[0]: row[1:] for row in cells}
+
+    rows = rows_of("maze15")
     assert rows["table2"][:2] == ["maze15", "6 of 6"]  # all published
     assert rows["table2"][3] == ""
-    assert rows["table1"][1] == "3 of 11"
-    # GC-BC acts for next to nothing; of SPiRL and PTGM nothing is published that tells a price.
-    assert rows["table1"][3] == "0.0 + ?"
+    assert rows["table1"][1] == "6 of 11"  # all that learn; the others act for next to nothing
+    assert float(rows["table1"][3]) < 1
+    # Of SPiRL and PTGM nothing is published in the larger mazes that tells a price.
+    assert re.fullmatch(r"\d\.\d \+ \?", rows_of("maze30")["table1"][3])
     spent = read_summary(Path("results/maze15/ucb"))["cpu_seconds"]
     assert rows["figure3"][1:3] == ["1 of 1", f"{spent / 60:.1f}"]
     assert rows["table3"][1] == "0 of 35"
@@ -360,7 +363,7 @@ def test_prices_are_those_of_relatives() -> None:
     ucb = 1 / read_summary(Path("results/maze15/ucb"))["episodes_per_cpu_second"]
     assert rate("maze15", methods.find("ucb")) == pytest.approx(ucb)
     assert rate("gridworld", methods.find("ppo")) == rate("gridworld", methods.find("reinforce"))
-    assert rate("gridworld", methods.find("spirl")) is None
+    assert rate("maze30", methods.find("spirl")) is None
     assert rate("gridworld", methods.find("gcbc")) == min(
         1 / read_summary(path)["episodes_per_cpu_second"]
         for path in Path("results/gridworld").iterdir()
