@@ -1,15 +1,32 @@
-"""Final minus initial return, with its interval over tasks: ``python -m examples.gain RUN_DIR ..``."""
+"""Differences of mean returns, with their 95 % intervals over tasks.
+
+python -m examples.gain RUN ..                        final minus initial return of each run
+python -m examples.gain RUN .. --minus OTHER          final returns minus those of another run
+python -m examples.gain RUN .. --minus-initial OTHER  final returns minus its initial ones
+"""
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 import numpy as np
 
 from experiments.store.statistics import gain_over_tasks
 
+
+def judged(folder: Path, index: int) -> np.ndarray:
+    """The returns [S, N] of a judgement: 0 is the initial one, -1 the final one."""
+    return np.load(folder / "results.npz")["eval_returns"][:, :, index]
+
+
 if __name__ == "__main__":
-    for folder in sys.argv[1:]:
-        returns = np.load(Path(folder) / "results.npz")["eval_returns"]
-        print(f"{folder}: {gain_over_tasks(returns[:, :, -1], returns[:, :, 0])}")
+    parser = argparse.ArgumentParser(usage=__doc__)
+    parser.add_argument("runs", type=Path, nargs="+")
+    parser.add_argument("--minus", type=Path)
+    parser.add_argument("--minus-initial", type=Path)
+    args = parser.parse_args()
+    for run in args.runs:
+        other = args.minus or args.minus_initial or run
+        before = judged(other, -1 if args.minus else 0)
+        print(f"{run}: {gain_over_tasks(judged(run, -1), before)}")
