@@ -34,7 +34,7 @@ def test_networks_and_sizes(tmp_path: Path) -> None:
     kinds = {
         network.kind: network.num_bytes for network in released_networks(envs.find("gridworld"))
     }
-    assert kinds.keys() == {"mgpo", "ptgm"}
+    assert kinds.keys() == {"mgpo", "ptgm", "spirl"}
     assert min(kinds.values()) > 1_000_000
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "a").write_bytes(b"123")
