@@ -87,7 +87,7 @@ def sample_prompt(
     Args:
       key: random key.
       trajectory: the trajectory to draw goals from. Candidates are the goals that it reached, except for
-        the final goal at its last step.
+        the goal of its last step if that goal is the trajectory's outcome.
       final_goal: the last goal of the prompt: ``hindsight_outcome(trajectory)`` in pre-training, the task
         goal g^M in adaptation.
       num_slots: P, the number of slots of the returned prompt (static).
@@ -103,7 +103,7 @@ def sample_prompt(
     key_count, key_index = jax.random.split(key)
     num_steps = trajectory.goal_reached.shape[0]
     time = jnp.arange(num_steps)
-    # The goal of the step that reaches the final goal would only repeat it.
+    # In hindsight the outcome is the final goal, which would only be repeated.
     repeats_end = (time == trajectory.length - 1) & jnp.all(
         trajectory.achieved_goals == trajectory.outcomes, axis=-1
     )

@@ -26,7 +26,7 @@ from mgpo_jax.baselines.methods import (
 from mgpo_jax.baselines.returns import advantages, returns_to_go
 from mgpo_jax.baselines.subsets import subset
 from mgpo_jax.distributions import HEADS
-from mgpo_jax.methods import Setting
+from mgpo_jax.methods import Setting, with_numbers
 from mgpo_jax.optimizers.base import PromptOptimizer
 from mgpo_jax.optimizers.methods import fixed_prompt, prompt_adapter
 from mgpo_jax.policy import transformer_policy
@@ -315,6 +315,26 @@ def test_a_strong_penalty_keeps_the_policy(params: Any, round_of_episodes: Any) 
     assert moved(100.0) < 0.2 * moved(0.0)
 
 
+def test_the_rate_of_the_policy_rises_over_the_rounds_that_train_it(
+    params: Any, round_of_episodes: Any
+) -> None:
+    """All epochs of a round have one rate, and rounds that only train the values do not count."""
+    _, _, query, episodes = round_of_episodes
+    hyper = PpoHyper(epochs=3, learning_rate=0.01, value_rounds=1, warmup_rounds=4)
+
+    @jax.jit
+    def told(rounds: Any, learning_rate: Any, warmup_rounds: Any) -> Any:
+        numbers = {"learning_rate": learning_rate, "warmup_rounds": warmup_rounds}
+        changed = with_numbers(hyper, numbers)
+        adapter = make_ppo(SETTING, params, changed)
+        state = adapter.init(jax.random.key(1), GOAL)._replace(rounds=rounds)
+        return adapter.tell(jax.random.key(4), state, query, episodes).weights.policy
+
+    assert_equal(told(0, 0.01, 4), params)
+    for rounds, share in ((1, 0.25), (2, 0.5), (4, 1.0), (9, 1.0)):
+        assert_close(told(rounds, 0.01, 4), told(rounds, share * 0.01, 0), 1e-6)
+
+
 @pytest.mark.optimized
 def test_a_round_ends_when_the_policy_has_moved_too_far(
     params: Any, round_of_episodes: Any
@@ -338,9 +358,11 @@ def test_values_alone_are_learned_at_first(params: Any, round_of_episodes: Any) 
         clip_norm=1e9, gae_lambda=1.0,
     )  # fmt: skip
     adapter = make_ppo(SETTING, params, hyper)
-    state = adapter.init(jax.random.key(1), GOAL)
-    state = jax.jit(adapter.tell)(jax.random.key(4), state, query, episodes)
+    start = adapter.init(jax.random.key(1), GOAL)
+    state = jax.jit(adapter.tell)(jax.random.key(4), start, query, episodes)
     assert_equal(state.weights.policy, params)
+    moments = lambda state: state.opt_state.inner_states["policy"]  # noqa: E731
+    assert_equal(moments(state), moments(start))
     real = jnp.arange(ENV.horizon) < episodes.trajectory.length[:, None]
     look = lambda obs, actions: GoalTransformer(NETWORK).apply(  # noqa: E731
         params, query.prompt, obs, actions, method="features"

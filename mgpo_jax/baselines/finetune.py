@@ -53,6 +53,9 @@ class Weights(NamedTuple):
     value: ValueHead
 
 
+POLICY, VALUE = Weights._fields
+
+
 class Learner(NamedTuple):
     """The state of fine-tuning on one task."""
 
@@ -109,20 +112,31 @@ def real_mean(values: Float[Array, "K T"], real: Bool[Array, "K T"]) -> Float[Ar
     return jnp.sum(jnp.where(real, values, 0.0)) / jnp.maximum(real.sum(), 1)
 
 
-def optimizer(hyper: FinetuneHyper, value_rate: Any) -> optax.GradientTransformation:
-    """AdamW with gradient clipping, separately for the policy and for the value head."""
+def optimizer(
+    hyper: FinetuneHyper, value_rate: Any, warmth: Float[Array, ""] | float = 1.0
+) -> optax.GradientTransformation:
+    """AdamW with gradient clipping, separately for the policy and for the value head.
+
+    Args:
+      hyper: the hyper-parameters.
+      value_rate: learning rate of the value head.
+      warmth: factor in [0, 1] of the policy's learning rate.
+    """
 
     def adamw(rate: Any) -> optax.GradientTransformation:
-        def schedule(count: Array) -> Array:
-            return rate * jnp.minimum((count + 1) / jnp.maximum(hyper.warmup_rounds, 1), 1.0)
-
         return optax.chain(
             optax.clip_by_global_norm(hyper.clip_norm),
-            optax.adamw(schedule, weight_decay=hyper.weight_decay),
+            optax.adamw(rate, weight_decay=hyper.weight_decay),
         )
 
-    kinds = {"policy": adamw(hyper.learning_rate), "value": adamw(value_rate)}
-    return optax.multi_transform(kinds, Weights._make(["policy", "value"]))
+    kinds = {"policy": adamw(hyper.learning_rate * warmth), "value": adamw(value_rate)}
+    return optax.multi_transform(kinds, Weights(POLICY, VALUE))
+
+
+def with_policy(state: Any, source: Any) -> Any:
+    """An optimizer's state in which the part of the policy is that of another state, ``source``."""
+    parts = {**state.inner_states, POLICY: source.inner_states[POLICY]}
+    return state._replace(inner_states=parts)
 
 
 class Finetuner:
@@ -139,7 +153,6 @@ class Finetuner:
         self.setting, self.params, self.hyper, self.how = setting, params, hyper, how
         self.network = GoalTransformer(setting.network)
         self.part: Subset = subset(hyper.tune, params, hyper.rank)
-        self.optimize = optimizer(hyper, how.value_rate)
 
     def adapter(self) -> Adapter:
         """The methods as an adapter."""
@@ -156,7 +169,8 @@ class Finetuner:
     def init(self, key: PRNGKeyArray, task_goal: Float[Array, "G"]) -> Learner:
         value = ValueHead(jnp.zeros(self.setting.network.embed_dim), jnp.zeros(()))
         weights = Weights(self.part.start(key), value)
-        return Learner(task_goal, weights, self.optimize.init(weights), jnp.zeros((), jnp.int32))
+        opt_state = optimizer(self.hyper, self.how.value_rate).init(weights)
+        return Learner(task_goal, weights, opt_state, jnp.zeros((), jnp.int32))
 
     def prompt_of(self, state: Learner) -> Prompt:
         """The prompt (g^M), which never changes."""
@@ -176,6 +190,9 @@ class Finetuner:
         del key
         batch = self._batch(state, query, episodes)
         loss_of = self.how.loss(batch)
+        round_ = state.rounds - self.how.value_rounds  # of those that train the policy
+        warmth = jnp.clip((round_ + 1) / jnp.maximum(self.hyper.warmup_rounds, 1), 0.0, 1.0)
+        optimize = optimizer(self.hyper, self.how.value_rate, warmth)
 
         def loss(weights: Weights) -> tuple[Array, Array]:
             now = self._forward(weights, batch)
@@ -189,11 +206,12 @@ class Finetuner:
             grads, moved = jax.grad(loss, has_aux=True)(weights)
             if self.how.max_kl is not None:
                 going = going & (moved <= self.how.max_kl)
-            updates, new_state = self.optimize.update(grads, opt_state, weights)
+            updates, new_state = optimize.update(grads, opt_state, weights)
             new = optax.apply_updates(weights, updates)
-            learns = state.rounds >= self.how.value_rounds
-            new = new._replace(policy=choose(learns, new.policy, weights.policy))
             new, new_state = choose(going, (new, new_state), (weights, opt_state))
+            # While only the value head learns, the policy keeps its weights and its moments.
+            held = new._replace(policy=weights.policy), with_policy(new_state, opt_state)
+            new, new_state = choose(round_ >= 0, (new, new_state), held)
             return new, new_state, going
 
         start = (state.weights, state.opt_state, jnp.ones((), bool))

@@ -33,7 +33,8 @@ class FinetuneHyper:
     clip_norm: Positive = 0.25
     """Largest global norm of a gradient (the paper does not say; the authors pre-train with 0.25)."""
     warmup_rounds: Annotated[int, Ge(0), Le(10_000)] = 0
-    """Number of rounds over which the learning rate rises to its value."""
+    """Number of rounds over which the learning rate of the policy rises to its value, from the first round
+    that trains the policy."""
     discount: Share = 0.98
     """Discount factor per step [0.98]."""
     kl: NotNegative = 0.0

@@ -3,8 +3,7 @@
 The first episode evaluates (g^M). Every later episode is spent on one of three things:
 
 - a prompt that is certainly better than the best one: its rehearsal (``planning.rehearsal``) reaches the
-task
-  goal in fewer steps;
+  task goal in fewer steps;
 - a prompt that may be better: its rehearsal leaves the map close enough to the task goal;
 - exploration: actions are sampled under a random prompt of the known path, or under one that leads to a
   frontier, a state from which the task goal could be reached sooner than by the known path.
