@@ -130,7 +130,7 @@ def optimizer(
         )
 
     kinds = {"policy": adamw(hyper.learning_rate * warmth), "value": adamw(value_rate)}
-    return optax.multi_transform(kinds, Weights(POLICY, VALUE))
+    return optax.multi_transform(kinds, Weights._make([POLICY, VALUE]))
 
 
 def with_policy(state: Any, source: Any) -> Any:
