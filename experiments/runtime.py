@@ -253,7 +253,7 @@ def explained(error: BaseException, config: Any = None) -> str:
         if isinstance(cause, MemoryError) or "RESOURCE_EXHAUSTED" in str(cause):
             less = "fewer tasks, seeds, episodes or trajectories, or a smaller batch or network"
             return f"out of memory; use {less}"
-    text = str(error).splitlines()[0] if str(error) else "no reason is known"
+    text = str(error).splitlines()[0] if str(error) else "no reason was given"
     if text.startswith(OF_CALLBACK):
         # A traceback follows, and its last line is the error on the host.
         return str(error).strip().splitlines()[-1].removeprefix("envs.errors.")

@@ -238,7 +238,7 @@ def test_observations_are_joined_and_goals_are_drawn() -> None:
     [
         ({"desired": lambda moment: [1.0]}, r"desired of plane has shape \[1\], achieved has \[2\]"),
         ({"horizon": None}, "no max_episode_steps; say after how many actions"),
-        ({"deterministic": False}, "give options, or leave out deterministic=False"),
+        ({"deterministic": False}, "pass options, or leave out deterministic=False"),
         ({"repeat": 0}, "repeat of plane must be at least 1"),
         ({"make": own_gymnasium.Switches}, "have no achieved_goal; say how to read it"),
         (

@@ -389,7 +389,7 @@ def test_a_policy_is_found_where_it_was_moved_with_its_results(
     assert load_policy_of(loaded, TINY).folder.resolve() == (tmp_path / "new/policy").resolve()
     (tmp_path / "new/policy").rename(tmp_path / "mine")
     with pytest.raises(
-        DataError, match=r"are not those .*; give the folder of the policy .*, using --policy"
+        DataError, match=r"are not those .*: give the folder of the policy .*, using --policy"
     ):
         load_policy_of(loaded, TINY)
     assert load_policy_of(loaded, TINY, tmp_path / "mine").sha256 == sha256

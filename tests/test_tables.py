@@ -434,7 +434,9 @@ def test_optimum_and_solved_are_known_together(copied: Path) -> None:
     with np.load(copied / "results.npz") as file:
         arrays = {name: array for name, array in file.items() if name != "optimal_returns"}
     np.savez(copied / "results.npz", **arrays)
-    with pytest.raises(DataError, match=r"solved_optimally is 0\.7266.*, .* it is unknown"):
+    with pytest.raises(
+        DataError, match=r"solved_optimally is 0\.7266.*, but results\.npz gives unknown"
+    ):
         read_row(copied)
     change(copied / "summary.json", solved_optimally=None)
     assert cells(read_row(copied))["solved optimally"] == ""
