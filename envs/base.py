@@ -330,7 +330,7 @@ class Environment:
         """
         del state, num_steps
         raise NotAvailableError(
-            f"{self.spec.name} tells no goals to go for (its class does not define expert_goal)"
+            f"{self.spec.name} provides no expert goals (its class does not define expert_goal)"
         )
 
     def fingerprint(self, task: Task) -> Int[Array, "F"]:
@@ -357,7 +357,7 @@ class Environment:
         can = np.asarray(jax.jit(jax.vmap(self.solvable))(jax.tree.map(jnp.asarray, tasks)))
         if not can.all():
             raise ValueError(
-                f"task {int(np.argmin(can))}: nobody can solve it in the {self.spec.horizon} steps of an "
+                f"task {int(np.argmin(can))} cannot be solved within the {self.spec.horizon} steps of an "
                 f"episode of {self.spec.name}"
             )
 

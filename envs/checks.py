@@ -58,9 +58,9 @@ class Report:
         lines += [f"note: {text}" for text in self.notes]
         if self.facts:
             lines.append(
-                "looked at {episodes:.0f} episodes with {steps:.0f} steps and at {tasks:.0f} tasks; "
-                "{steps_per_cpu_second:,.0f} steps per CPU-second, {compile_seconds:.1f} CPU-seconds to "
-                "compile".format(**self.facts)
+                "checked {episodes:.0f} episodes with {steps:.0f} steps and {tasks:.0f} tasks; "
+                "{steps_per_cpu_second:,.0f} steps per CPU-second, compilation took "
+                "{compile_seconds:.1f} CPU-seconds".format(**self.facts)
             )
         return "\n".join(lines)
 
@@ -257,7 +257,10 @@ def _shape_faults(env: Environment) -> Iterator[str]:
             yield from _misfit(f"{part} of {name}", getattr(told, part), shape, dtype)
     old_fields: Any = jax.tree.structure(state)
     if old_fields != jax.tree.structure(after):
-        yield "the state of step has other fields than that of reset"
+        yield (
+            "the state returned by step has different fields from the state returned by reset; both must "
+            "have the same structure"
+        )
         return
     for (path, old), new in zip(
         jax.tree_util.tree_leaves_with_path(state), jax.tree.leaves(after), strict=True
@@ -300,8 +303,8 @@ def _task_faults(env: Environment, tasks: Task, again: Task, num_test_tasks: int
         yield f"all of {num} sampled tasks are the same; sample_task must use its key"
     elif different < num_test_tasks:
         yield (
-            f"{num} draws gave only {different} different tasks, the world's record keeps {num_test_tasks} "
-            "for test; make tasks more diverse, or lower num_test_tasks"
+            f"{num} draws gave only {different} different tasks, but the world's record needs "
+            f"{num_test_tasks} test tasks; make tasks more diverse, or lower num_test_tasks"
         )
     goals = np.asarray(jax.vmap(env.task_goal)(tasks))
     if not np.isfinite(goals).all():
@@ -317,7 +320,7 @@ def _first_demonstrator(
         if demonstrator.env in (None, env):
             return demonstrator
         notes.append(
-            f"the demonstrator {name} acts in another world, so its episodes are not looked at"
+            f"the demonstrator {name} acts in another world, so its episodes are not checked"
         )
     return None
 
@@ -478,7 +481,10 @@ def _absorbing_faults(case: _Case) -> Iterator[str]:
             differs = np.array([not np.array_equal(row, rows[0]) for row in rows])
             if differs.any():
                 step = end + _first(differs)[0]
-                yield f"{case.place(lane, step)} has another {name} than the end at step {end + 1}"
+                yield (
+                    f"{case.place(lane, step)} has a different {name} from that at the end of the episode, "
+                    f"step {end + 1}; terminal states must stay as they are"
+                )
                 changed = True
         if changed or paid.any() or moved.any():
             return
@@ -528,8 +534,8 @@ def _goal_faults(case: _Case) -> Iterator[str]:
         silent = (steps.reward > 0) & ~steps.goal_reached
         if silent.any():
             yield (
-                f"{case.place(*_first(silent))} pays a reward without a goal that is reached, although the "
-                "spec says reward_confirms_goals"
+                f"{case.place(*_first(silent))} gives a positive reward although no goal is reached; with "
+                "spec.reward_confirms_goals=True, goal_reached must be true there"
             )
     yield from _outcome_faults(case)
 
@@ -600,12 +606,13 @@ def _chance_faults(case: _Case, notes: list[str]) -> Iterator[str]:
     where = _difference(case.played, _numpy(case.play(others, case.tasks, case.actions)))
     if where and case.env.spec.deterministic:
         yield (
-            f"the spec says deterministic, and yet with another key but the same task and actions "
+            "spec.deterministic is True, but with a different key and the same task and actions, "
             f"{_at(case, where)}"
         )
     if where is None and not case.env.spec.deterministic:
         notes.append(
-            f"the spec does not say deterministic, and {LANES} episodes were the same with other keys"
+            f"spec.deterministic is False, but {LANES} episodes were the same with different keys; set it "
+            "to True if nothing in the world is random"
         )
 
 
@@ -619,7 +626,10 @@ def _program_faults(case: _Case) -> Iterator[str]:
     one = _numpy(alone(case.keys[lane], task, case.actions[lane]))
     kept = jax.tree.map(lambda rows: rows[lane : lane + 1], case.played)
     if where := _difference(kept, jax.tree.map(lambda leaf: leaf[None], one), CLOSE):
-        yield f"vmap changes the world: against the same episode alone, {_at(case, where)}"
+        yield (
+            "vmap changes the results: compared with running the same episode alone, "
+            f"{_at(case, where)}"
+        )
     try:
         state, first = case.env.reset(case.keys[lane], task)
         told = []
@@ -627,10 +637,13 @@ def _program_faults(case: _Case) -> Iterator[str]:
             state, timestep = case.env.step(state, action)
             told.append(timestep._replace(failed=jnp.asarray(timestep.failed)))
     except Exception as error:
-        yield f"the world runs under jit only; without it there is {_reason(error)}"
+        yield f"the world works only under jit; without jit it raises {_reason(error)}"
         return
     steps = jax.tree.map(lambda *rows: np.stack([np.asarray(row) for row in rows])[None], *told)
     eager = _Played(jax.tree.map(lambda leaf: np.asarray(leaf)[None], first), steps, None)
     short = jax.tree.map(lambda rows: rows[:, :EAGER_STEPS], kept.steps)
     if where := _difference(_Played(kept.first, short, None), eager, CLOSE):
-        yield f"jit changes the world: against the same episode without it, {_at(case, where)}"
+        yield (
+            "jit changes the results: compared with running the same episode without jit, "
+            f"{_at(case, where)}"
+        )

@@ -103,8 +103,8 @@ class GymnasiumWorld:
     def __post_init__(self) -> None:
         if self.options is None and not self.deterministic:
             raise UsageError(
-                f"{self.name} has tasks without options, which are seeds, so that its episodes are "
-                "deterministic; give options, or leave out deterministic=False"
+                f"without options, a task of {self.name} is only a seed, so its episodes must be "
+                "deterministic; pass options, or leave out deterministic=False"
             )
         for what, value in (
             ("repeat", self.repeat),
@@ -330,5 +330,5 @@ def _to_32_bits(array: np.ndarray) -> np.ndarray:
     if array.dtype.kind in "bu":
         return array.astype(np.uint8) if array.dtype == bool else array
     raise UsageError(
-        f"an array of {array.dtype} is none that a world can have; make it one of numbers"
+        f"arrays of dtype {array.dtype} are not supported; convert the array to numbers"
     )

@@ -214,9 +214,10 @@ class Pool:
         if live.identity != identity:
             self._release(live.env)
             raise DataError(
-                f"the gymnasium environment does not repeat itself: reset with seed {start.seed} and "
-                f"{len(actions)} actions once more, it tells something else than before; all of its chance "
-                "must come from the seed of reset, and reset must forget all earlier episodes"
+                "the gymnasium environment is not reproducible: after reset with seed "
+                f"{start.seed} and the same {len(actions)} actions, its outputs differ from the first "
+                "time; all its randomness must come from the seed given to reset, and reset must clear "
+                "everything left from earlier episodes"
             )
         return live
 

@@ -1,9 +1,9 @@
-"""Comparing a world with the official program that it re-implements: episodes in both, stepped from Python.
+"""Comparing a world with its official implementation: episodes in both, stepped from Python.
 
-If a world re-implements an official program by others, its record says how to run that
+If a world re-implements a program by others, the *official implementation*, its record says how to run that
 (``World.official``). Then the same agent can act in both and the results can be compared, without having to
-trust the re-implementation. Both are stepped one step at a time from Python, since the official program
-requires that.
+trust the re-implementation. Both are stepped one step at a time from Python, since the official
+implementation requires that.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Acting(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Official:
-    """The official program that a world re-implements.
+    """The official implementation of a world, a program by others.
 
     Attributes:
       name: its name and version.

@@ -49,8 +49,8 @@ class Judgement:
     def __post_init__(self) -> None:
         if not (0 < self.temperature < math.inf and self.episodes >= 1):
             raise UsageError(
-                "policies are judged at a temperature above 0 in at least one episode, found temperature "
-                f"{self.temperature} and {self.episodes} episodes"
+                "a Judgement needs a finite temperature above 0 and at least one episode, found "
+                f"temperature {self.temperature} and {self.episodes} episodes"
             )
 
 
@@ -106,7 +106,7 @@ class World:
         have a success rate and SPL [None: another kind of task].
       extra: the extra of this package that it needs [none].
       num_test_tasks: number of test tasks.
-      official: the official program by others that this world re-implements, for comparisons [none].
+      official: the official implementation by others, to compare this world with [none].
     """
 
     name: str
@@ -260,7 +260,7 @@ class Registry(Generic[Record]):
         if taken is not None and taken is not record:
             # Files are stored by name, so two records of the same name would share their files.
             raise UsageError(
-                f"{place} has the name of the {self.kind} {name!r}; give it another one"
+                f"{place} has the name {name!r}, which another {self.kind} already has; rename it"
             )
         return record
 

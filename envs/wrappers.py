@@ -120,7 +120,8 @@ class Noisy(Wrapper):
             )
         if (self.obs_noise or any(self.obs_range)) and self.env.spec.layout is not None:
             raise ValueError(
-                f"noise on observations needs amounts, those of {self.env.spec.name} are codes and counts"
+                "noise on observations needs quantities on a continuous scale, but those of "
+                f"{self.env.spec.name} are codes and counts"
             )
 
     def _range_text(self) -> str:

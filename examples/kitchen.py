@@ -57,4 +57,4 @@ WORLD = GymnasiumWorld(
     most=16,
     threads=None,
     reward_confirms_goals=True,
-).world(summary="FrankaKitchen with an order that is not told", num_test_tasks=6)
+).world(summary="FrankaKitchen with a hidden order", num_test_tasks=6)

@@ -9,19 +9,19 @@ from importlib.metadata import version
 from envs.errors import nearest
 
 COMMANDS = {
-    "list": "the worlds, methods and networks there are, and what each needs",
-    "info": "what is installed, on which devices",
+    "list": "list the worlds, methods and networks, and what each needs",
+    "info": "show what is installed, and on which devices",
     "collect": "collect a dataset of demonstrations",
     "data": "import, export, check and describe datasets of your own logs",
     "pretrain": "pre-train a policy",
     "adapt": "adapt a policy to unseen tasks",
     "evaluate": "evaluate optimized prompts once more, under noise or in another world",
-    "check": "compare a world with its official program, under optimized prompts",
+    "check": "check a world of your own, or compare a world with its official implementation",
     "table": "compare adaptations in one table",
     "compare": "compare adaptations to the same tasks pair by pair, with intervals",
     "plot": "draw figures of adaptations",
     "report": "show adaptations in one HTML page, down to every episode",
-    "playground": "make an HTML page in which anyone leads a policy by goals",
+    "playground": "make an HTML page in which anyone guides a policy by clicking goals",
     "export": "write a policy as ONNX models, which run without jax",
     "reproduce": "make tables and figures of the paper",
     "release": "package a pre-training run as a released policy",

@@ -44,7 +44,7 @@ from mgpo_jax.policy_files import load_policy
 from mgpo_jax.tasks import test_tasks
 
 EPISODES = 100  # episodes of an adaptation
-GO_ON = "run the same command again to go on"
+GO_ON = "run the same command again to continue"
 UNFINISHED = "unfinished-"  # prefix of folders with the finished pieces of an unfinished adaptation
 LONGEST = 5  # maximum number of goals in a prompt where the paper varies c
 
@@ -146,7 +146,7 @@ def adapted(
     complete = all(map(Path.exists, folders))
     if complete and not pieces.exists():
         return
-    with claimed(pieces), farewell(lambda: f"stopped; what is finished is kept, {GO_ON}"):
+    with claimed(pieces), farewell(lambda: f"stopped; finished work is kept; {GO_ON}"):
         if not complete:
             print(f"adapting with {policy_folder or 'the released policy'}", file=sys.stderr)
             journal, meta = open_journal(pieces, variants, provenance())
@@ -213,8 +213,8 @@ def table5(config: ReproduceConfig) -> list[Part]:
     names = demonstrators(config)
     if len(names) < 2:
         raise NotAvailableError(
-            f"there is no table5 for {config.world}: it compares datasets of several demonstrators; "
-            "name another world with --env"
+            f"table5 is not available for {config.world}, which has a single demonstrator: it compares "
+            "datasets of several; name another world with --env"
         )
     return compared(config, sorted(names), lambda name: planned(config, name, name))
 
@@ -238,8 +238,8 @@ def heads(config: ReproduceConfig) -> list[Part]:
     """
     if envs.make(config.world).spec.discrete:
         raise NotAvailableError(
-            f"there is no heads for {config.world}: it compares distributions of continuous actions; "
-            "name another world with --env"
+            f"heads is not available for {config.world}, whose actions are discrete: it compares "
+            "distributions of continuous actions; name another world with --env"
         )
     names = [name for name in HEADS if name != "categorical"]
     return compared(config, names, lambda head: planned(config, head, head=head))
@@ -255,8 +255,8 @@ def plan(config: ReproduceConfig) -> list[Part]:
     spec = envs.make(config.world).spec
     if not (spec.goals_are_states and spec.discrete):
         raise NotAvailableError(
-            f"there is no plan for {config.world}: it leaves out parts of the plan in worlds of discrete "
-            "actions whose goals are states; name another world with --env"
+            f"plan is not available for {config.world}: it leaves out parts of the plan in worlds of "
+            "discrete actions whose goals are states; name another world with --env"
         )
     world = envs.find(config.world)
     variants: dict[str, dict[str, Any]] = {

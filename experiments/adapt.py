@@ -52,7 +52,7 @@ def main(config: AdaptConfig) -> None:
 
         variants(config)
     if config.sweep or not (config.resume and os.path.isdir(folder)):
-        refuse_existing(folder, "remove it", "choose another with --out")
+        refuse_existing(folder, "remove it", "choose another folder with --out")
     world = envs.find(config.env)
     join(config)
     from envs.wrappers import behind_noise
@@ -79,7 +79,7 @@ def main(config: AdaptConfig) -> None:
         results = adapt_and_save(folder, config, world, env, policy, tasks)
     elif processes.is_first():
         results = finished(folder, config, policy, tasks)
-        print(f"{folder} is finished already", file=sys.stderr)
+        print(f"{folder} is already finished", file=sys.stderr)
     if results is None:  # only process 0 has them
         return
     say(json.dumps(results.summary, indent=2) if config.json else printed(results.summary))

@@ -124,13 +124,13 @@ def finished(folder: Path, config: AdaptConfig, policy: LoadedPolicy, tasks: Tas
     """
     remove_leftovers(folder, PIECES)
     results = load_results(folder)
-    check_weights(results, policy, f"remove {folder}, or choose another with --out")
+    check_weights(results, policy, f"remove {folder}, or choose another folder with --out")
     made = read_document(folder / META, dict[str, Json], ADAPT_AGAIN).get("settings")
     now = deciding(config, policy, tasks)
     changed = changes(made, now) if isinstance(made, dict) else "made by an older version"
     if changed:
         raise UsageError(
-            f"{folder} holds results of other settings: {changed}; choose another with --out"
+            f"{folder} holds results of other settings: {changed}; choose another folder with --out"
         )
     return results
 

@@ -26,6 +26,7 @@ from mgpo_jax import processes
 from mgpo_jax.settings import Name, NumTrajectories
 
 COLUMNS = (18, 10, 18, 0)  # widths of name, value, unit and note
+STOPPED = "stopped; the measurements so far are valid; run the command again for the others"
 
 
 @dataclass(frozen=True)
@@ -72,14 +73,14 @@ def main(config: BenchConfig) -> None:
         find_demonstrator(envs.find(config.env), envs.make(config.env), config.demonstrator)
     rows = []
     num = config.trajectories or (500 if config.quick else 5_000)
-    with farewell(lambda: "stopped; the figures so far stand, run it again for the others"):
+    with farewell(lambda: STOPPED):
         for row in measurements(config.env, config.demonstrator, num, config.quick, config.rows):
             rows.append(row)
             cells = (row.name, f"{row.value:>10.3f}", row.unit, row.note)
             say(aligned(cells, COLUMNS))
     if config.json and processes.is_first():
         write_json(config.json, {"env": config.env, "rows": rows, **provenance()})
-        print(f"rows in {config.json}", file=sys.stderr)
+        print(f"results written to {config.json}", file=sys.stderr)
 
 
 def show_layouts(config: BenchConfig) -> None:

@@ -1,4 +1,4 @@
-"""Check a world, or compare one with its official program under optimized prompts.
+"""Check a world, or compare one with its official implementation under optimized prompts.
 
 ``python -m experiments.check my_package.my_world:WORLD`` and ``python -m experiments.check RUN_DIR``.
 """
@@ -28,9 +28,10 @@ class CheckConfig(Common):
 
     runs: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Worlds to check, by name or as module:attribute; or result folders of adaptations, whose worlds are
-    compared with their official programs."""
+    compared with their official implementations."""
     env: Name | None = None
-    """The world to compare with its official program (default: the one that the prompts were found in)."""
+    """The world to compare with its official implementation (default: the one that the prompts were found
+    in)."""
     policy: Path | None = None
     """Folder of the policy that the results were made with, if it has been moved."""
     out: Path | None = None
@@ -39,7 +40,7 @@ class CheckConfig(Common):
 
 def main(config: CheckConfig) -> None:
     """Check whether worlds satisfy the environment contract; given result folders, act greedily under their
-    optimized prompts in a world and in its official program, and compare."""
+    optimized prompts in a world and in its official implementation, and compare."""
     if not config.runs:
         raise UsageError(
             "no result folder given, and no world; usage: python -m experiments.check RUN_DIR ..., or "
@@ -94,11 +95,15 @@ def check(names: Sequence[str], out: Path | None) -> None:
         write_json(out, {"worlds": found, **provenance()})
     broken = [name for name, report in reports.items() if report.faults]
     if broken:
-        raise DataError(f"{', '.join(broken)} must be mended before it is trained on")
+        raise DataError(
+            f"faults found in {', '.join(broken)}; fix those listed above before training on it"
+            if len(broken) == 1
+            else f"faults found in {', '.join(broken)}; fix those listed above before training on them"
+        )
 
 
 def compare_runs(config: CheckConfig) -> None:
-    """Compare the worlds of adaptations with their official programs."""
+    """Compare the worlds of adaptations with their official implementations."""
     from experiments.checking import HEAD, cells, compare, officials_of, summaries, told
     from experiments.evaluation import open_case
     from experiments.store.provenance import provenance
@@ -127,7 +132,7 @@ def compare_runs(config: CheckConfig) -> None:
             rows.append(row)
     report()
     if config.out:
-        print(f"rows in {config.out}", file=sys.stderr)
+        print(f"results written to {config.out}", file=sys.stderr)
 
 
 def command(argv: Sequence[str] | None = None) -> NoReturn:

@@ -1,4 +1,4 @@
-"""Compare what a policy reaches under optimized prompts in a world and in its official program.
+"""Compare what a policy reaches under optimized prompts in a world and in its official implementation.
 
 Two episodes agree if they reach the same goals in the same order.
 """
@@ -24,10 +24,10 @@ SAME_RETURN = 1e-5  # returns that differ by less are equal up to rounding
 
 
 def officials_of(cases: Sequence[Case]) -> list[Official]:
-    """The official programs of the worlds of some adaptations.
+    """The official implementations of the worlds of some adaptations.
 
     Raises:
-      UsageError: if a world has none, or the program's dependencies are not installed.
+      UsageError: if a world has none, or its dependencies are not installed.
     """
     return [find_official(case.env, envs.make(case.env)) for case in cases]
 
@@ -102,8 +102,8 @@ def summaries(cases: Sequence[Case], rows: Sequence[dict[str, Any]]) -> list[dic
 
 
 HEAD = (
-    "folder", "seed", "task", "wanted", "reached here", "reached officially", "return here", "officially",
-    "agree",
+    "folder", "seed", "task", "task description", "goals reached", "goals reached (official)", "return",
+    "return (official)", "agree",
 )  # fmt: skip
 
 

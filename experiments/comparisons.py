@@ -39,7 +39,7 @@ from mgpo_jax.policy_files import load_policy
 from mgpo_jax.tasks import num_tasks, test_tasks
 
 PUBLISHED = Path("results")
-GO_ON = "run the same command again to go on"
+GO_ON = "run the same command again to continue"
 SMOKE_TASKS, SMOKE_EPISODES = 5, 20
 
 
@@ -72,7 +72,7 @@ TABLES: Mapping[str, Comparison] = {
         further=("plan",),
     ),
     "table3": Comparison(
-        title="Table 3: optimized prompts behind noise",
+        title="Table 3: optimized prompts under noise",
         methods=("grips", "bbt", "ucb", "bpe"),
         further=("explore",),
     ),
@@ -226,7 +226,7 @@ def published(config: ReproduceConfig, settings: AdaptConfig) -> Path | None:
     try:
         row = read_row(folder)
     except DataError as error:
-        print(f"{folder} is not used: {error}", file=sys.stderr)
+        print(f"ignoring {folder}: {error}", file=sys.stderr)
         return None
     summary = row.summary
     size = (summary["num_seeds"], summary["num_episodes"])
@@ -360,7 +360,7 @@ def _draw_in(config: ReproduceConfig, world: str) -> list[Path]:
     for method in figure.methods:
         cell = made(config, world, method)
         if cell.results is None:
-            raise UsageError(f"there is no {config.what} for {world}: {cell.reason}")
+            raise UsageError(f"{config.what} is not available for {world}: {cell.reason}")
         results[method] = load_results(cell.results)
     place = config.out / f"{config.what}-{config.scale}_{file_name(world)}.md"
     saves = {
@@ -370,7 +370,7 @@ def _draw_in(config: ReproduceConfig, world: str) -> list[Path]:
     }
     if not saves and figure.numbers is None:
         raise NotAvailableError(
-            f"there is no {config.what} for {world}, which draws nothing like it"
+            f"{config.what} is not available for {world}, which does not draw such a figure"
         )
     check_replaceable((place, *saves) if figure.numbers else saves)
     config.out.mkdir(parents=True, exist_ok=True)

@@ -87,7 +87,10 @@ def _settings(values: Mapping[str, Any], given: set[str]) -> Iterator[tuple[str,
                 yield from _settings(value, given)
         elif name not in OWN and name not in given and value is not None:
             if isinstance(value, Mapping):
-                raise DataError(f"the config has no setting {shown(name)} of one value")
+                raise DataError(
+                    f"the setting {shown(name)} in the config file must be a single value, found an "
+                    "object; remove it from the file"
+                )
             yield name, value
 
 

@@ -38,7 +38,7 @@ def import_logs(config: ImportConfig) -> None:
     """Convert logs to a dataset, which `experiments.pretrain --data FOLDER` trains on."""
     check_import(config)
     assert config.out is not None
-    refuse_existing(config.out, "remove it", "choose another with --out")
+    refuse_existing(config.out, "remove it", "choose another folder with --out")
     from experiments.importing import import_dataset
 
     say(import_dataset(config))
@@ -52,7 +52,7 @@ def export_logs(config: ExportConfig) -> None:
     if config.out.suffix == ".npz":
         refuse_existing_file(config.out, "--out")
     else:
-        refuse_existing(config.out, "remove it", "choose another with --out")
+        refuse_existing(config.out, "remove it", "choose another folder with --out")
     from experiments.exporting_data import export_dataset
 
     export_dataset(folder, config.out, config.author)
@@ -69,7 +69,7 @@ def check_data(config: CheckDataConfig) -> None:
         say(line)
     if found.faults:
         raise DataError(
-            f"{folder} has {found.num_faults} fault(s) of {len(found.faults)} kind(s); mend the logs, or "
+            f"{folder} has {found.num_faults} fault(s) of {len(found.faults)} kind(s); fix the logs, or "
             "leave these trajectories out, and import them again"
         )
 

@@ -401,10 +401,10 @@ def collect_and_save(
         if processes.is_first():
             remove_leftovers(folder, PIECES)
             load_dataset(folder, env.spec, {**made, "num_trajectories": config.trajectories})
-            print(f"{folder} is finished already", file=sys.stderr)
+            print(f"{folder} is already finished", file=sys.stderr)
         return
     if processes.is_first() and not wait:
-        refuse_existing(folder, "remove it", "choose another with --out")
+        refuse_existing(folder, "remove it", "choose another folder with --out")
     if processes.is_first():
         check_place(folder, num_bytes=config.trajectories * SMALLEST_TRAJECTORY)
     with long_work(folder, asked, provenance(), config.resume, wait, go_on) as work:

@@ -28,7 +28,7 @@ class EvaluateConfig(Joined):
     found in)."""
     obs_noise: tuple[NotNegative | Literal["official"], ...] = ()
     """Standard deviations of the noise on observations, in their units, or ``official`` for the noise that
-    the world's official program adds by default; a row for each."""
+    the world's official implementation adds by default; a row for each."""
     action_noise: tuple[NotNegative, ...] = ()
     """Standard deviations of the noise on continuous actions, or probabilities of a random action for
     discrete ones; a row for each."""
@@ -80,10 +80,10 @@ def main(config: EvaluateConfig) -> None:
         say(goals)
     if num_failed := sum(row["failed_episodes"] for row in rows):
         total = sum(row["num_episodes"] for row in rows)
-        say(f"{num_failed} of {total} episodes ended because the world broke down")
+        say(f"{num_failed} of {total} episodes ended because the simulation failed")
     if config.json and processes.is_first():
         write_json(config.json, {"rows": rows, **provenance()})
-        print(f"rows in {config.json}", file=sys.stderr)
+        print(f"results written to {config.json}", file=sys.stderr)
 
 
 def command(argv: Sequence[str] | None = None) -> NoReturn:

@@ -32,7 +32,7 @@ from mgpo_jax.seen_goals import warning_of_prompts
 from mgpo_jax.tasks import tasks_from
 
 OFFICIAL: Literal["official"] = "official"
-"""Stands for the noise on observations that the world's official program adds by default."""
+"""Stands for the noise on observations that the world's official implementation adds by default."""
 
 
 class Noise(NamedTuple):
@@ -116,16 +116,17 @@ def open_case(
 
 
 def find_official(name: str, env: Environment) -> Official:
-    """The official program of a world.
+    """The official implementation of a world.
 
     Raises:
-      UsageError: if it has none, or the program's dependencies are not installed.
+      UsageError: if it has none, or its dependencies are not installed.
     """
     make = envs.find(name).official
     if make is None:
         having = [world.name for world in WORLDS.usable() if world.official is not None]
         raise UsageError(
-            f"{name} has no official program; worlds that have one: {', '.join(having) or 'none'}"
+            f"{name} has no official implementation to compare with; worlds that have one: "
+            f"{', '.join(having) or 'none'}"
         )
     try:
         return make(env)
@@ -134,7 +135,8 @@ def find_official(name: str, env: Environment) -> Official:
 
 
 def _official_noise(name: str, env: Environment, sizes: Sequence[Noise]) -> tuple[float, ...]:
-    """Half widths of the observation noise of a world's official program; empty if no noise asks for it.
+    """Half widths of the observation noise of a world's official implementation; empty if no noise asks
+    for it.
 
     Raises:
       UsageError: if there is no such program, or it adds no noise.
@@ -150,7 +152,8 @@ def _official_noise(name: str, env: Environment, sizes: Sequence[Noise]) -> tupl
 
 
 def _add_noise(noise: Noise, env: Environment, obs_range: tuple[float, ...]) -> Noisy:
-    """The world with noise added; ``obs_range`` has the half widths of its official program's noise."""
+    """The world with noise added; ``obs_range`` has the half widths of the noise of its official
+    implementation."""
     if isinstance(noise.obs, str):
         return Noisy(env, action_noise=noise.action, obs_range=obs_range)
     return Noisy(env, noise.obs, noise.action)
@@ -235,7 +238,7 @@ def achieved_table(rows: Sequence[dict[str, Any]]) -> str:
 
 
 HEAD = (
-    "folder", "env", "method", "tasks x seeds x episodes", "adapted", "noise",
+    "folder", "env", "method", "tasks x seeds x episodes", "return in the adaptation", "noise",
     "return (mean ± std over seeds)", "change",
 )  # fmt: skip
 

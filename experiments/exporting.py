@@ -29,7 +29,7 @@ def check_exportable(config: TransformerConfig, name: str) -> None:
     if config.head != "categorical" or config.encoder != "linear":
         raise UsageError(
             f"the policy of {name} has the head {config.head} and the encoder {config.encoder}; an export "
-            "needs categorical and linear"
+            "supports only the head categorical with the encoder linear"
         )
 
 

@@ -44,7 +44,10 @@ def of_adaptation(
     rate = seconds_per_episode(config.env, method)
     rows = [
         ("searches", f"{num} tasks x {config.seeds} seeds x {_num_variants(config)} variants"),
-        ("episodes", f"{lanes * config.episodes:,} of the searches, {lanes * judged:,} that judge"),
+        (
+            "episodes",
+            f"{lanes * config.episodes:,} for searching, {lanes * judged:,} for evaluation",
+        ),
         ("steps", f"at most {lanes * (config.episodes + judged) * env.spec.horizon:,}"),
         ("network", f"{_num_weights(policy.params):,} weights"),
         ("memory", f"{log_bytes(env, lanes, config.episodes) / 1e6:,.0f} MB of results at most"),
@@ -54,7 +57,7 @@ def of_adaptation(
         ),
         ("results", str(config.folder)),
     ]
-    return block(f"{config.env}, {config.method}: nothing is done yet", rows)
+    return block(f"{config.env}, {config.method}: dry run, nothing is computed", rows)
 
 
 def _num_variants(config: AdaptConfig) -> int:
@@ -91,7 +94,7 @@ def of_training(config: PretrainConfig) -> str:
         ("CPU time", _cpu_time(None if folder is not None else price_of(config))),
         ("run", str(config.folder)),
     ]
-    return block(f"{config.env}, {config.method}: nothing is done yet", rows)
+    return block(f"{config.env}, {config.method}: dry run, nothing is computed", rows)
 
 
 def _num_weights(params: Any) -> int:
@@ -101,7 +104,7 @@ def _num_weights(params: Any) -> int:
 
 def _cpu_time(seconds: float | None) -> str:
     if seconds is None:
-        return "not known: nothing like it was measured"
+        return "unknown: no similar run has been measured"
     if seconds < 120:
-        return f"some {seconds:.0f} seconds, and compiling"
-    return f"some {seconds / 60:.0f} minutes, and compiling"
+        return f"about {seconds:.0f} seconds, plus compilation"
+    return f"about {seconds / 60:.0f} minutes, plus compilation"

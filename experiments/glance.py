@@ -37,7 +37,7 @@ def glance_of(world: World, others: Sequence[str] = ()) -> Glance:
     """
     env = envs.make(world.name)
     if world.pictures is None:
-        raise UsageError("it draws nothing")
+        raise UsageError("the world draws no pictures")
     key = jax.random.key(SEED)
     task = jax.jit(env.sample_task)(key)
     goal = np.asarray(env.task_goal(task))
@@ -49,7 +49,7 @@ def glance_of(world: World, others: Sequence[str] = ()) -> Glance:
         play=partial(_play_episode, world, env, task),
     )
     if draw is None:
-        raise UsageError("it draws nothing that stands still")
+        raise UsageError("the world draws no still pictures, only videos")
     also = f" Also: {', '.join(others)}." if others else ""
     return Glance(world.name, f"{_sentence(world.summary)}{also}", draw)
 
@@ -90,7 +90,7 @@ def worlds_together(names: Sequence[str]) -> list[tuple[World, list[str]]]:
 
 
 def _say_left_out(name: str, error: Exception) -> None:
-    print(f"{printable(name)} is left out: {printable(str(error))}", file=sys.stderr)
+    print(f"skipping {printable(name)}: {printable(str(error))}", file=sys.stderr)
 
 
 def file_of(config: ReproduceConfig) -> Path:

@@ -145,7 +145,7 @@ def load_function(place: str) -> Callable[..., Any]:
     except (ImportError, AttributeError, ValueError) as error:
         raise UsageError(f"--goal {place} cannot be loaded: {printable(str(error))}") from None
     if not callable(function):
-        raise UsageError(f"--goal {place} is no function, found {shown(function)}")
+        raise UsageError(f"--goal {place} is not a function, found {shown(function)}")
     return function
 
 
@@ -255,7 +255,7 @@ class Converter:
                 raise DataError(
                     f"{who}: integer actions must have one number a step, found shape "
                     f"{list(actions.shape)}; "
-                    "give --action-low and --action-high if they are amounts"
+                    "give --action-low and --action-high if they are quantities"
                 )
             most = self.config.num_actions or self.source.num_actions or LARGEST_INT.max
             if actions.min() < 0 or actions.max() >= most:
@@ -325,8 +325,8 @@ class Converter:
             flat = obs.reshape(len(obs), -1)
             if (most := max(config.goal_columns)) >= flat.shape[1]:
                 raise UsageError(
-                    f"--goal-columns {most} is none of the {flat.shape[1]} components of an "
-                    "observation, which are counted from 0; choose another"
+                    f"--goal-columns {most} is out of range: observations have {flat.shape[1]} components, "
+                    "counted from 0; choose another"
                 )
             found, what = flat[:, list(config.goal_columns)], "--goal-columns"
         elif config.goal_array:
@@ -391,7 +391,7 @@ def import_dataset(config: ImportConfig) -> str:
                     _check_length(who, len(rows["actions"]), horizon)
                 except BadEpisodeError as error:
                     if not config.skip_bad:
-                        text = f"{error}; mend it, or leave such episodes out with --skip-bad"
+                        text = f"{error}; fix it, or leave such episodes out with --skip-bad"
                         raise DataError(text) from None
                     skipped.append(str(error))
                     continue
@@ -408,8 +408,8 @@ def import_dataset(config: ImportConfig) -> str:
     ]
     if converter.num_cut:
         said.append(
-            f"  {converter.num_cut} episodes have no observation after their last action, which was left "
-            "out"
+            f"  {converter.num_cut} episodes have no observation after their last action, so that action "
+            "was dropped"
         )
     said += [f"  left out: {printable(text)}" for text in skipped[:5]]
     if len(skipped) > 5:

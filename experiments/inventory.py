@@ -44,9 +44,9 @@ from mgpo_jax.released import released_folder
 HEAD = (
     "what",
     "world",
-    "cells there",
-    "CPU-minutes of those",
-    "CPU-minutes of the missing (estimate)",
+    "cells done",
+    "CPU-minutes spent",
+    "CPU-minutes for the rest (estimate)",
 )
 
 

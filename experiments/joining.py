@@ -34,7 +34,7 @@ HEARTBEATS = 100  # seconds without a sign of life until jax gives up a process;
 LEAVING = 20  # seconds that jax waits for the others at shutdown, when all have reached it
 SAME = 2.0  # seconds within which an error common to all processes occurs in each of them
 PLACE = struct.Struct(">64sQQ16s")  # host, process number, port and password
-GO_ON = {"resume": "go on with --resume", "": "run the same command again"}
+GO_ON = {"resume": "continue with --resume", "": "run the same command again"}
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,13 @@ def check_flags(config: Joined) -> None:
     given = [name for name in OF_PROCESSES[1:] if getattr(config, name) is not None]
     if given and not config.distributed:
         value = shown(getattr(config, given[0]))
-        raise UsageError(f"{flag(given[0])} {value} is for several processes; add --distributed")
+        raise UsageError(
+            f"{flag(given[0])} {value} only works with --distributed; add --distributed, or leave it out"
+        )
     if config.distributed and getattr(config, "dry_run", False):
-        raise UsageError("--dry-run computes nothing that could be spread; leave out --distributed")
+        raise UsageError(
+            "--dry-run computes nothing, so it cannot be distributed; leave out --distributed"
+        )
     if given and len(given) < 3:
         missing = next(name for name in OF_PROCESSES[1:] if name not in given)
         raise UsageError(
@@ -79,8 +83,8 @@ def check_flags(config: Joined) -> None:
         )
     if config.process >= config.processes:
         raise UsageError(
-            f"--process counts from 0: of {config.processes} processes the last is "
-            f"{config.processes - 1}, found {config.process}"
+            f"--process must be from 0 to {config.processes - 1}, since there are {config.processes} "
+            f"processes, found {config.process}"
         )
 
 
@@ -137,8 +141,8 @@ def _start(config: Joined) -> None:
         if place:
             raise
         raise UsageError(
-            "--distributed finds no variables of SLURM, Open MPI or a TPU slice that say who the processes "
-            "are; give --coordinator HOST:PORT --processes N --process I"
+            "--distributed found no environment variables of SLURM, Open MPI or a TPU slice that identify "
+            "the processes; give --coordinator HOST:PORT --processes N --process I"
         ) from None
     except RuntimeError as error:
         where = config.coordinator or "the place that the scheduler names"
@@ -243,7 +247,7 @@ def _react(event: str, member: Member, text: str, go_on: str) -> None:
         if not (_failed.is_set() or signals.is_leaving()):
             _end(f"{member} failed: {text}")
     elif not (_failed.is_set() or signals.is_leaving()):
-        _end(f"{member} (process number {member.pid} there) is gone; {go_on}")
+        _end(f"{member} (pid {member.pid}) has ended unexpectedly; {go_on}")
 
 
 _failed = threading.Event()  # set when this process fails because of an error of its own

@@ -193,7 +193,7 @@ def _step_rows(
     yield Row("  real steps", lengths.sum() / cpu, "steps / CPU-s", "padding not counted")
     yield Row("  real tokens", flops / cpu / 1e9, "GFLOP / CPU-s", "padding not counted")
     yield Row("  matrix product", rate, "GFLOP / CPU-s", "2048 x 2048, same run, before and after")
-    yield Row("  share of it", 100 * flops / cpu / 1e9 / rate, "%")
+    yield Row("  relative speed", 100 * flops / cpu / 1e9 / rate, "%", "of the matrix product")
     yield Row("  padding", 100 * (1 - lengths.sum() / padded), "%", "of the steps computed")
     unit = 1e9 if platform.system() == "Darwin" else 1e6  # bytes on macOS, kilobytes elsewhere
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit

@@ -185,7 +185,7 @@ def _refuse_unknown(unknown: Sequence[str], known: Sequence[str], prog: str) -> 
             near = difflib.get_close_matches(_flag_of(word), known, n=1)
             hint = f"; did you mean {near[0]}?" if near else ""
             raise UsageError(f"unknown flag {shown(name)}{hint}; {_way_out(prog)}")
-    raise UsageError(f"no flag takes the word {shown(unknown[0])}; {_way_out(prog)}")
+    raise UsageError(f"unexpected argument {shown(unknown[0])}; {_way_out(prog)}")
 
 
 def _registry() -> ConstructorRegistry:

@@ -42,7 +42,7 @@ def main(config: ReleaseConfig) -> None:
 
     finished = read_run(config.source, config.env)
     folder = config.out or finished.released
-    refuse_existing(folder, "remove it", "choose another with --out")
+    refuse_existing(folder, "remove it", "choose another folder with --out")
     release(finished, folder)
     print(f"released in {folder}", file=sys.stderr)
 

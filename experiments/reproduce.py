@@ -109,7 +109,7 @@ def make_all(config: ReproduceConfig) -> None:
         try:
             make(job)
         except NotAvailableError as error:
-            print(f"{printable(name)} is left out: {printable(str(error))}", file=sys.stderr)
+            print(f"skipping {printable(name)}: {printable(str(error))}", file=sys.stderr)
         except (UsageError, DataError) as error:
             print(f"{printable(name)} failed: {printable(str(error))}", file=sys.stderr)
             failed.append(name)

@@ -157,7 +157,7 @@ def _rows_in(folder: Path) -> tuple[Behind, ...]:
         try:
             found += read_document(path, _Rows).rows
         except DataError as error:
-            print(f"{path} is not used: {error}", file=sys.stderr)
+            print(f"ignoring {path}: {error}", file=sys.stderr)
     return tuple(found)
 
 
@@ -176,7 +176,7 @@ def rows_of(config: ReproduceConfig, world: str, method: str) -> Iterator[Row]:
                 cases[noise] = open_case(cell.results, None, [noise])
             except UsageError as error:  # a noise that this world does not have
                 rows[noise] = row._replace(reason=str(error))
-    with farewell(lambda: f"stopped; what is finished is kept, {GO_ON}"):
+    with farewell(lambda: f"stopped; finished work is kept; {GO_ON}"):
         spent = time.process_time()
         measured = evaluate_cases(list(cases.values()), num_episodes(config), 0) if cases else ()
         for noise, values in zip(cases, measured, strict=True):
@@ -201,8 +201,8 @@ def as_table(rows: Sequence[Row]) -> str:
     """The table in Markdown, with notes on what is missing and what the numbers mean."""
     notes = Notes()
     notes.add(
-        "The paper does not say how much noise it had: its number stands beside every size. The change "
-        "is that against the world without noise."
+        "The paper does not state its noise level, so its number is repeated beside each of ours. The "
+        "change is relative to the return without noise."
     )
     lines = [_line(row, notes) for row in rows]
     return f"{table(HEAD, lines)}\n\n" + "".join(f"- {note}\n" for note in notes.lines)

@@ -82,7 +82,8 @@ def configure() -> None:
     try:
         os.makedirs(cache, mode=0o700, exist_ok=True)  # private: programs are loaded from there
     except OSError as error:
-        print(f"compiled programs are not kept: {cache}: {error.strerror}", file=sys.stderr)
+        text = f"cannot cache compiled programs in {cache} ({error.strerror}): every command compiles again"
+        print(f"{text}; set MGPO_CACHE to a writable folder", file=sys.stderr)
         return
     warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation")
     os.environ["JAX_COMPILATION_CACHE_DIR"] = cache
@@ -112,9 +113,7 @@ def expect_compiling() -> None:
     except OSError:
         empty = True
     if empty:
-        text = (
-            "no compiled programs are kept yet: this begins with compiling, for up to two minutes"
-        )
+        text = "the compilation cache is empty: compiling first, which can take up to two minutes"
         print(text, file=sys.stderr)
 
 
@@ -242,25 +241,29 @@ def explained(error: BaseException, config: Any = None) -> str:
             )
             where = f" for {folder}" if folder else ""
             again = "--resume" if hasattr(config, "resume") else "the same command"
-            return f"there is no room left on the disk{where}; make room and go on with {again}"
+            return f"no space left on the disk{where}; free some space and continue with {again}"
         if isinstance(cause, OSError) and cause.errno in (errno.EACCES, errno.EROFS, errno.EPERM):
             what = cause.filename or "a file"
-            return f"{what} cannot be read or written ({cause.strerror}); change its rights"
+            return f"{what} cannot be read or written ({cause.strerror}); change its permissions"
         if isinstance(cause, FileExistsError):  # such as a link to nowhere in place of a folder
-            return f"{cause.filename} exists already and is no folder; remove it or choose another place"
+            return f"{cause.filename} already exists and is not a folder; remove it or choose another place"
         if isinstance(cause, OSError) and cause.errno == errno.ENAMETOOLONG:
             where = _flag_of(config, cause.filename)
             return f"{where}the name {shown(cause.filename)} is too long; choose a shorter one"
         if isinstance(cause, MemoryError) or "RESOURCE_EXHAUSTED" in str(cause):
-            return "there is not enough memory; ask for less at once"
-    text = str(error).splitlines()[0] if str(error) else "no reason is known"
+            less = "fewer tasks, seeds, episodes or trajectories, or a smaller batch or network"
+            return f"out of memory; use {less}"
+    text = str(error).splitlines()[0] if str(error) else "no reason was given"
     if text.startswith(OF_CALLBACK):
         # A traceback follows, and its last line is the error on the host.
         return str(error).strip().splitlines()[-1].removeprefix("envs.errors.")
     platforms = os.environ.get("JAX_PLATFORMS")
     if platforms and "nable to initialize backend" in text:
-        return f"JAX_PLATFORMS={platforms} names no device of this machine; unset it, or use cpu"
-    return f"something went wrong that was not foreseen: {text}; run with --debug to see where"
+        return (
+            f"JAX_PLATFORMS={platforms} names a platform that is not available on this machine; unset it, "
+            "or set it to cpu"
+        )
+    return f"unexpected error: {text}; run with --debug to see the traceback"
 
 
 def _flag_of(config: Any, path: Any) -> str:
@@ -318,14 +321,14 @@ def require_runs(runs: Sequence[Path], command: str) -> None:
 def refuse_existing(folder: Path, *ways_out: str) -> None:
     """Raise ``UsageError`` if an output exists, with ways out in the message, or if it cannot be made."""
     if os.path.lexists(folder):
-        raise UsageError(f"{folder} exists already; {', or '.join(ways_out)}")
+        raise UsageError(f"{folder} already exists; {', or '.join(ways_out)}")
     check_place(folder)
 
 
 def refuse_existing_file(path: Path, named_by: str) -> None:
     """Raise ``UsageError`` if an output file exists, or if it cannot be made."""
     if os.path.lexists(path):
-        raise UsageError(f"{named_by} {path} exists already; remove it or choose another file")
+        raise UsageError(f"{named_by} {path} already exists; remove it or choose another file")
     require_parent(path, named_by)
     check_place(path, named_by)
 

@@ -67,7 +67,10 @@ class _Watch:
             os._exit(128 + number)
         elif self.patient and not again:
             if len(self.asked) == 1:
-                _say("stopping soon; a second request ends it at once")
+                _say(
+                    "finishing the current step and saving a checkpoint; press Ctrl-C (or send the signal) "
+                    "again to stop at once"
+                )
         elif not self.leaving:
             self.leaving = True
             threading.Thread(target=self._leave, args=(number,), daemon=True).start()

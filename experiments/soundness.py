@@ -183,8 +183,8 @@ def _misaligned(dataset: Dataset, facts: Facts, found: Findings) -> None:
     """
     if facts.obs_size > MOST_NUMBERS or facts.action_dim > MOST_NUMBERS:
         found.notes["alignment"].append(
-            f"whether actions belong to their steps is not looked at: observations have {facts.obs_size} "
-            f"numbers, actions {facts.action_dim}, and {MOST_NUMBERS} are the most"
+            f"the alignment of actions with steps is not checked: observations have {facts.obs_size} "
+            f"numbers and actions {facts.action_dim}, and the check supports at most {MOST_NUMBERS} of each"
         )
         return
     starts, lengths = dataset.starts, dataset.lengths
@@ -199,7 +199,7 @@ def _misaligned(dataset: Dataset, facts: Facts, found: Findings) -> None:
     inner = inner[np.argsort(np.random.default_rng(1).random(len(inner)))]
     if len(inner) < 200:
         found.notes["alignment"].append(
-            f"whether actions belong to their steps cannot be told from {len(inner)} steps; 200 are needed"
+            f"the alignment of actions with steps cannot be checked on {len(inner)} steps; 200 are needed"
         )
         return
     obs = {lag: _numbers(dataset.obs, inner + lag) for lag in (-1, 0, 1)}
@@ -217,10 +217,10 @@ def _misaligned(dataset: Dataset, facts: Facts, found: Findings) -> None:
         if better > MARGIN and shifted:
             other = "before" if lag < 0 else "after"
             found.faults["misaligned"].append(
-                f"{_place(dataset, int(inner.min()))} and all others: the action belongs to the "
-                f"{where} its "
-                f"own, for the action in the row {other} explains {explained[lag]:.0%} of how observations "
-                f"change, that in their own row {explained[0]:.0%}"
+                f"{_place(dataset, int(inner.min()))} and all others: the action seems to belong to the "
+                f"{where} its own: the action one row {other} explains {explained[lag]:.0%} of the "
+                f"variance of the change in observations, the action in the same row {explained[0]:.0%}; "
+                "shift the actions by one step"
             )
 
 

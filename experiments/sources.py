@@ -86,8 +86,8 @@ def opened(source: str) -> Iterator[Source]:
         yield _flat("npz", _npz(path), path)
     elif path.is_file():
         raise UsageError(
-            f"{source} is no file that can be imported; give one that ends in .npz, {', '.join(HDF5)}, a "
-            "folder of episodes, or a Minari dataset"
+            f"{source} is not a file that can be imported; give a file that ends in .npz or "
+            f"{', '.join(HDF5)}, a folder of episodes, or a Minari dataset"
         )
     else:
         yield _minari(_minari_by_id(source))
@@ -244,8 +244,8 @@ def _ends(arrays: Mapping[str, Any], num_steps: int, path: Path) -> np.ndarray:
     flags = [first_of(names, arrays) for names in (TERMINATED, TRUNCATED)]
     if all(flag is None for flag in flags):
         raise DataError(
-            f"{path} has neither terminals, timeouts nor lengths, so that nobody can tell where its "
-            "episodes end; add an array lengths with the number of actions of every episode"
+            f"{path} has no terminals, timeouts or lengths, so the ends of its episodes are unknown; add "
+            "an array named lengths with the number of actions in each episode"
         )
     over = np.zeros(num_steps, bool)
     for flag in flags:
@@ -304,7 +304,8 @@ def _parquet(path: Path) -> dict[str, np.ndarray]:
             array = np.array(rows)
         except ValueError:
             raise DataError(
-                f"{path}: column {shown(name)} holds lists of different lengths, which are no array"
+                f"{path}: column {shown(name)} holds lists of different lengths, which cannot form an "
+                "array; pad them or leave the column out"
             ) from None
         if array.dtype.kind in "biuf":
             found[name] = array

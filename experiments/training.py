@@ -404,7 +404,7 @@ def train(config: PretrainConfig, go_on: str = "continue with --resume") -> None
         farewell(lambda: f"stopped; {go_on}" if runs.has_begun(folder) else ""),
     ):
         if processes.from_first(lambda: _has_ended(config)):
-            print(f"{folder} is finished already", file=sys.stderr)
+            print(f"{folder} is already finished", file=sys.stderr)
             return
         run = Run(config, go_on)
         if processes.is_first():
@@ -463,7 +463,7 @@ def _describe_continuation(config: TrainConfig, trained: int) -> str:
     rate = float(learning_rate_schedule(config)(trained))
     falls = "falls along the same cosine" if config.schedule == "cosine" else "stays there"
     return (
-        f"the run has {trained:,} steps and goes on to {config.steps:,}: the learning rate is that of a "
+        f"the run has {trained:,} steps and continues to {config.steps:,}: the learning rate is that of a "
         f"training of {config.steps:,} steps, {rate:.3g} at first, and {falls}"
     )
 

@@ -93,7 +93,9 @@ class Actor:
         """
         horizon = self.config.horizon
         if not self._step:
-            raise UsageError("call reset with the first observation of the episode")
+            raise UsageError(
+                "act was called before reset; call reset with the first observation of the episode"
+            )
         if self._step >= horizon:
             raise UsageError(
                 f"the policy was trained for episodes of {horizon} steps; call reset to begin another"

@@ -18,6 +18,11 @@ from envs.episodes import run_episode
 from mgpo_jax.prompts import hindsight_outcome
 from mgpo_jax.trees import choose, put_row
 
+CHECK_RETURNS = (
+    "check the world's rewards (`python -m experiments.check WORLD`) and the policy's weights"
+)
+"""How to find the reason of a return that is not finite, the end of a message."""
+
 
 class Adapter(NamedTuple):
     """A method that adapts to one task, as pure functions over an explicit state.

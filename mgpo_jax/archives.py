@@ -159,7 +159,8 @@ def mapped_headers(folder: Path, names: Iterable[str], mend: str = "") -> dict[s
                 held = os.fstat(file.fileno()).st_size - header.offset
             if header.size * header.dtype.itemsize != held:
                 raise _FaultError(
-                    f" claims shape {list(header.shape)} of {header.dtype}, the file has {held} bytes of it"
+                    f" declares shape {list(header.shape)} of {header.dtype}, but holds {held} bytes of "
+                    "data"
                 )
         except FileNotFoundError:
             raise DataError(f"{path} is missing{tail_of(mend)}") from None
@@ -199,7 +200,11 @@ def mapped_arrays(
         _check_shapes(headers, fields, sizes or {})
         for name, header in headers.items():
             if header.fortran or header.dtype != fields[name].target(header.dtype):
-                raise _FaultError(f": {name} has the dtype or order {header.dtype}, not its own")
+                order = " in Fortran order" if header.fortran else ""
+                raise _FaultError(
+                    f": {name} has the wrong dtype or memory order, found {header.dtype}{order}, expected "
+                    f"{fields[name].target(header.dtype)} in C order"
+                )
             place = _npy(folder, name)
             array = (
                 np.memmap(place, header.dtype, "r", header.offset, header.shape)
@@ -269,7 +274,7 @@ def read_arrays(
     with _opened(path, mend) as archive:
         members = _members(archive)
         if only and (foreign := sorted(members.keys() - fields.keys())):
-            raise _FaultError(f": {printable(foreign[0])} is foreign")
+            raise _FaultError(f" has the unexpected array {printable(foreign[0])}")
         headers = {
             name: _header(archive, name, members[name]) for name in fields if name in members
         }
@@ -342,7 +347,7 @@ def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
     for info in infos:
         name = info.filename.removesuffix(".npy")
         if name in found:
-            raise _damaged(name, "is there twice")
+            raise _damaged(name, "occurs twice")
         found[name] = info
     return found
 
@@ -364,7 +369,7 @@ def _read_header(name: str, file: Any) -> ArrayHeader:
     """Read the header from the first bytes of an array in npy format."""
     start = file.read(8)
     if start[:6] != b"\x93NUMPY":
-        raise _damaged(name, "is no array")
+        raise _damaged(name, "is not an array")
     width = {1: 2, 2: 4, 3: 4}.get(start[6], 0) if len(start) == 8 else 0
     length = int.from_bytes(file.read(width), "little")
     if not width or length > MAX_HEADER:
@@ -379,7 +384,7 @@ def _parsed_header(name: str, text: bytes, offset: int) -> ArrayHeader:
         said = ast.literal_eval(text.decode("latin1").strip())
         descr, fortran, shape = (said[key] for key in ("descr", "fortran_order", "shape"))
         if not isinstance(descr, str):
-            raise _damaged(name, "holds records")
+            raise _damaged(name, "has a structured dtype")
         if not re.fullmatch(r"[<>|=]?[biufcSUVOmM?]\d{0,9}(\[\w{1,9}\])?", descr):
             raise ValueError
         dtype = np.dtype(descr)
@@ -458,7 +463,7 @@ def _check_claims(
         most = info.compress_size * (1 if stored else DEFLATE) + (0 if stored else DEFLATE)
         if header.size * header.dtype.itemsize != held or not info.file_size <= most:
             raise _FaultError(
-                f": {name} claims shape {list(header.shape)} of {header.dtype}, the file has "
+                f": {name} declares shape {list(header.shape)} of {header.dtype}, but the file holds "
                 f"{min(held, most)} bytes of it"
             )
 
@@ -477,7 +482,7 @@ def _check_unpacked_size(
     )
     if total > max(FREE, MAX_RATIO * file_size):
         raise _FaultError(
-            f" claims {total >> 20} MB of arrays in a file of {file_size >> 20} MB, which cannot be sound"
+            f" declares {total >> 20} MB of arrays in a file of {file_size >> 20} MB, so it must be damaged"
         )
 
 

@@ -54,7 +54,7 @@ def checkpoints(folder: Path, keep: int = 2) -> Iterator[ocp.CheckpointManager]:
     folder = Path(folder).absolute()
     if folder.exists() and not folder.is_dir():
         raise DataError(
-            f"{folder} is no folder; remove it to start the training from its first step"
+            f"{folder} is not a folder; remove it to start the training from its first step"
         )
     folder.mkdir(parents=True, exist_ok=True)
     own = processes.index()

@@ -77,7 +77,7 @@ def claimed(folder: Path, wait: bool = False) -> Iterator[None]:
             break
         time.sleep(0.001)
     else:
-        raise cannot_write(folder, "it is made and removed all the time")
+        raise cannot_write(folder, "another process keeps creating and removing it")
     claim = Claim(folder, descriptor, made)
     try:
         with cleaned_on_exit(claim.leave):
@@ -121,7 +121,7 @@ def _lock(descriptor: int, folder: Path, wait: bool) -> None:
         who = f"process {holder}" if holder else "another process"
         if not wait:
             raise InUseError(
-                f"{folder} is in use by {who}; wait for its end or choose another place with --out"
+                f"{folder} is in use by {who}; wait until it finishes, or choose another folder with --out"
             ) from None
         print(f"waiting for {who}, which works in {folder}", file=sys.stderr)
         fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -140,7 +140,7 @@ def _is_still_at(path: Path, descriptor: int) -> bool:
 
 def cannot_write(folder: Path, reason: str | None) -> UsageError:
     """The error for a folder in which nothing can be written."""
-    return UsageError(f"cannot write to {folder} ({reason}); choose another place with --out")
+    return UsageError(f"cannot write to {folder} ({reason}); choose another folder with --out")
 
 
 def check_place(path: Path, flag: str = "--out", num_bytes: int = 1 << 20) -> None:
@@ -166,7 +166,7 @@ def check_place(path: Path, flag: str = "--out", num_bytes: int = 1 << 20) -> No
     if too_long:
         fault = "its name is too long"
     elif not os.path.isdir(place):
-        fault = f"{place} is no folder"
+        fault = f"{place} is not a folder"
     elif not os.access(place, os.W_OK | os.X_OK):
         fault = f"{place} is not writable"
     elif free < num_bytes:

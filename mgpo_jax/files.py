@@ -162,12 +162,12 @@ def remove_leftovers(folder: Path, keep: str = "") -> None:
 
 
 class ExistsError(DataError):
-    """The folder to be created exists already."""
+    """The folder to be created already exists."""
 
 
 def exists_already(folder: Path) -> ExistsError:
-    """The error for a folder that exists already."""
-    return ExistsError(f"{folder} exists already; remove it or choose another place with --out")
+    """The error for a folder that already exists."""
+    return ExistsError(f"{folder} already exists; remove it or choose another folder with --out")
 
 
 def partial_name(folder: Path) -> Path:
@@ -187,8 +187,8 @@ def _check_own(partial: Path, keep: str) -> None:
     foreign = [path for path in partial.iterdir() if path.name not in (LOCK, PLACE, keep)]
     if foreign:
         raise UsageError(
-            f"{foreign[0]} is in the way, which is no work of a command; move it, or choose another place "
-            "with --out"
+            f"{foreign[0]} is in the way and was not written by this command; move it, or choose another "
+            "folder with --out"
         )
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from envs.base import Environment, Episode, Task
 from envs.errors import DataError, NotAvailableError
 from mgpo_jax.adaptation import (
+    CHECK_RETURNS,
     Judged,
     achieved_goals,
     judge,
@@ -158,8 +159,8 @@ def _run_queries(
     if not (finite := np.isfinite(found.return_)).all():
         which, task = np.argwhere(~finite)[0]
         raise DataError(
-            f"a return on task {task} with seed number {which} is {found.return_[which, task]}; the world "
-            "or the policy is broken"
+            f"the return of an evaluation episode on task {task} with seed number {which} is "
+            f"{found.return_[which, task]}; {CHECK_RETURNS}"
         )
     return found
 

@@ -52,7 +52,7 @@ class Learned:
     loss: Callable[..., Any]
     complete: Callable[[Any, Any, Any], Any] = _unchanged
     agent: Callable[[Any, Any, Any], Agent] | None = None
-    facts: Callable[[Any], Mapping[str, str]] = lambda config: {"network": "of its own kind"}
+    facts: Callable[[Any], Mapping[str, str]] = lambda config: {"network": "custom architecture"}
     fault: Callable[[Any], str | None] = lambda config: None
 
 

@@ -143,8 +143,8 @@ def foreign_setting(name: str, method: Method) -> UsageError:
         for other in others
         if name in {field.name for field in dataclasses.fields(other.hyper)}
     ]
-    hint = f"; it is one of {', '.join(having)}" if having else ""
-    return UsageError(f"--{name.replace('_', '-')} is no setting of {method.name}{hint}")
+    hint = f"; it belongs to {', '.join(having)}" if having else ""
+    return UsageError(f"--{name.replace('_', '-')} is not a setting of {method.name}{hint}")
 
 
 def split_hyper(hypers: Sequence[Any]) -> tuple[Any, dict[str, list[int | float]]]:
@@ -164,7 +164,9 @@ def split_hyper(hypers: Sequence[Any]) -> tuple[Any, dict[str, list[int | float]
         if numeric and not field.metadata.get("static"):
             numbers[field.name] = values
         elif any(value != values[0] for value in values):
-            raise UsageError(f"{field.name} cannot differ between the variants of one program")
+            raise UsageError(
+                f"{field.name} cannot be swept, because it changes the compiled program"
+            )
     return with_numbers(first, dict.fromkeys(numbers, 0)), numbers
 
 
@@ -289,7 +291,8 @@ BPE = Method(
 PLAN = Method(
     name="plan",
     title="plan",
-    summary="keeps all that it saw as a model of the task, plans in it, and rehearses prompts for the plan",
+    summary="builds a model of the task from all that it has seen, plans in it, and rehearses prompts "
+    "there before acting",
     make="mgpo_jax.planning.methods:make_plan",
     check=f"{_HERE}:check_prompts",
     hyper=PlanHyper,
@@ -321,7 +324,7 @@ BBT = Method(
 GCBC = Method(
     name="gcbc",
     title="GC-BC",
-    summary="goal-conditioned behavior cloning; the prompt stays (g^M) in every episode",
+    summary="goal-conditioned behavior cloning; the prompt is always the task goal (g^M) alone",
     make=f"{_HERE}:make_gcbc",
     learns=False,
 )

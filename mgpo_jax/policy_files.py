@@ -86,7 +86,9 @@ def save_policy(
     files = _Files(arrays, seen_goals)
     for name, array in arrays.items():
         if not np.isfinite(array).all():
-            raise DataError(f"{folder} is not written: weight {name} holds NaN or infinity")
+            raise DataError(
+                f"the policy was not saved to {folder}: the weight {name} holds NaN or infinity"
+            )
     document = {"format": FORMAT, "network": dataclasses.asdict(config), "made": made}
     if (kind := kind_of(config).name) != MULTI_GOAL:
         document["kind"] = kind
@@ -343,11 +345,14 @@ def _layout_fault(config: NetworkConfig) -> str | None:
     layout = config.obs_layout
     encoder = ENCODERS.find(config.encoder)
     if not encoder.uses_layout:
-        return None if layout is None else f"obs_layout is of no use to encoder {config.encoder}"
+        return None if layout is None else f"obs_layout does not apply to encoder {config.encoder}"
     if layout is None:
         return f"obs_layout must not be null with encoder {config.encoder}"
     if config.obs_mean:
-        return f"obs_mean must be empty with encoder {config.encoder}, whose codes are no amounts"
+        return (
+            f"obs_mean must be empty with encoder {config.encoder}, whose inputs are codes rather than "
+            "quantities"
+        )
     said = encoder.fault(layout, config.obs_shape)
     return said and f"obs_layout {said}"
 

@@ -33,6 +33,7 @@ MEETING = 60.0  # seconds in which all processes must have connected
 # TCP keepalive: after ``SILENT`` seconds without traffic, ``PROBES`` probes are sent, ``BETWEEN`` seconds
 # apart; a host that answers none of them counts as gone.
 SILENT, PROBES, BETWEEN = 10, 3, 5
+NETWORK = "check that the network and firewalls allow the connection"
 
 _HEAD = struct.Struct(">cIQ")  # kind of message, index of the sender, number of bytes that follow
 _PIECE, _DONE, _SIGNAL, _FAILED, _GONE = b"p", b"d", b"s", b"f", b"g"
@@ -217,7 +218,7 @@ class Door:
                     missing = next(one for one in members[1:] if one.number not in links)
                     raise DataError(
                         f"{missing} has not connected to process 0 on {members[0].host} within "
-                        f"{MEETING:.0f} s; see whether the network lets it"
+                        f"{MEETING:.0f} s; {NETWORK}"
                     ) from None
                 if secrets.compare_digest(said[:-4], self.password):
                     links[struct.unpack(">I", said[-4:])[0]] = _with_keepalive(link)
@@ -240,7 +241,7 @@ def connected(places: Sequence[str], port: int, password: bytes, index: int) -> 
             return _with_keepalive(link)
         except OSError as error:
             fault = f"{place}:{port}: {error}"
-    raise DataError(f"process 0 cannot be reached at {fault}; see whether the network lets it")
+    raise DataError(f"process 0 cannot be reached at {fault}; {NETWORK}")
 
 
 def _with_keepalive(link: socket.socket) -> socket.socket:

@@ -26,6 +26,7 @@ from envs.registry import Judgement, World
 from envs.registry import find as find_world
 from mgpo_jax import processes
 from mgpo_jax.adaptation import (
+    CHECK_RETURNS,
     Adapter,
     AdaptLog,
     Judged,
@@ -380,13 +381,12 @@ def _check_finite(log: AdaptLog, judged: Judged, grid: Grid, rounds_before: int)
         value, what = log.returns[lane, index, episode], f"round {rounds_before + index + 1}"
     elif not judging.all():
         lane = np.argmin(judging)
-        value, what = judged.return_[lane], "a judging episode"
+        value, what = judged.return_[lane], "an evaluation episode"
     else:
         return
     seed, task = divmod(int(lane) % (grid.seeds * grid.tasks), grid.tasks)
     raise DataError(
-        f"the return of {what} on task {task} with seed number {seed} is {value}; the world or the policy "
-        "is broken"
+        f"the return of {what} on task {task} with seed number {seed} is {value}; {CHECK_RETURNS}"
     )
 
 

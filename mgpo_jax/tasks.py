@@ -45,7 +45,10 @@ def benchmark_tasks(env: Environment, num: int) -> Task:
     rows = [np.asarray(leaf).reshape(2 * num, -1) for leaf in jax.tree.leaves(drawn)]
     _, first = np.unique(np.concatenate(rows, axis=1), axis=0, return_index=True)
     if len(first) < num:
-        raise DataError(f"{env.spec.name} has too few tasks to test on {num} different ones")
+        raise DataError(
+            f"{2 * num} random tasks of {env.spec.name} include only {len(first)} different ones, too few "
+            f"for {num} test tasks; lower num_test_tasks"
+        )
     chosen = np.sort(first)[:num]
     return jax.tree.map(lambda leaf: leaf[chosen], drawn)
 
@@ -88,7 +91,11 @@ def evaluation_tasks(
     allowed = ~np.isin(task_hashes(env, drawn), forbidden)
     chosen = np.flatnonzero(allowed)[:num]
     if len(chosen) < num:
-        raise DataError(f"{env.spec.name} has too few tasks to evaluate on {num} others")
+        others = "neither test tasks nor used during training" if seed else "not test tasks"
+        raise DataError(
+            f"of {2 * num} random tasks of {env.spec.name}, only {len(chosen)} are {others}, too few for "
+            f"{num} validation tasks; ask for fewer, or lower num_test_tasks"
+        )
     return jax.tree.map(lambda leaf: leaf[chosen], drawn)
 
 
@@ -126,7 +133,7 @@ def save_tasks(path: Path, tasks: Task) -> None:
     write_arrays(Path(path), task_arrays(tasks))
 
 
-MEND = "mend that task or leave it out"
+MEND = "fix that task or leave it out"
 
 
 def load_tasks(path: Path, env: Environment) -> Task:

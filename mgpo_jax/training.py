@@ -259,7 +259,7 @@ def _facts(config: TransformerConfig) -> dict[str, str]:
     order = "with" if config.prompt_order else "without"
     return {
         "network": transformer_told(config),
-        "prompts": f"up to {config.max_prompt_length} goals, {order} an order embedding",
+        "prompts": f"up to {config.max_prompt_length} goals, {order} position embeddings",
     }
 
 
@@ -379,8 +379,8 @@ class Trainer:
             )
         if config.obs_noise and network_config.obs_layout is not None:
             raise UsageError(
-                f"--obs-noise has no use where --encoder {network_config.encoder} rounds the codes and "
-                "counts of observations; leave it out"
+                f"--obs-noise does not apply to --encoder {network_config.encoder}, which rounds the codes "
+                "and counts of observations; leave it out"
             )
         learned = kind_of(network_config).load()
         self._key_init, key_steps, self._key_eval = jax.random.split(jax.random.key(config.seed), 3)

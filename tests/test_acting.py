@@ -159,7 +159,9 @@ def test_fractions_are_no_bytes():
 
 
 def test_an_episode_begins_with_reset(policy):
-    with pytest.raises(UsageError, match="call reset with the first observation"):
+    with pytest.raises(
+        UsageError, match="act was called before reset; call reset with the first observation"
+    ):
         Actor(policy, [[0.5, 0.5]]).act(FIRST)
 
 

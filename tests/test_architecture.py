@@ -340,7 +340,7 @@ def test_help_and_usage_errors_need_no_jax() -> None:
         "adapt --nonsense 1": "",
         "adapt --episodes 0": "--episodes must be at least 1",
         "adapt --method ubc": "unknown method 'ubc'; did you mean 'ucb'?",
-        "adapt --method bpe --c 2": "--c is no setting of bpe",
+        "adapt --method bpe --c 2": "--c is not a setting of bpe",
         "adapt --env maze51": "did you mean 'maze15'?",
         "pretrain --env maze51": "did you mean 'maze15'?",
         "pretrain --preset papr": "did you mean 'paper'?",

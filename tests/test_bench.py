@@ -57,7 +57,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     found = {row["name"].strip(): row for row in rows}
     assert found["collection"]["note"].startswith("astar2")
     assert all(row["value"] > 0 for row in rows)
-    assert found["share of it"]["value"] < 100
+    assert found["relative speed"]["value"] < 100
     printed = capsys.readouterr().out
     assert all(name in printed for name in found)
 

@@ -120,9 +120,12 @@ def test_a_difference_is_shown(result: Path, register: Any, capsys: Any) -> None
 
 def test_a_world_without_an_official_program(result: Path, register: Any) -> None:
     register(None)
-    with pytest.raises(UsageError, match="tiny has no official program; worlds that have one: kit"):
+    with pytest.raises(
+        UsageError,
+        match="tiny has no official implementation to compare with; worlds that have one: kit",
+    ):
         check(CheckConfig(runs=(result,)))
-    with pytest.raises(UsageError, match="tiny has no official program"):
+    with pytest.raises(UsageError, match="tiny has no official implementation to compare"):
         open_case(result, None, noises(["official"], ()))
 
 

@@ -169,7 +169,7 @@ def test_no_sound_checkpoint_is_left(tmp_path: Path, params: dict) -> None:
 
 def test_a_file_in_the_place_of_checkpoints(tmp_path: Path) -> None:
     (tmp_path / "checkpoints").write_text("")
-    refused = pytest.raises(DataError, match="is no folder; remove it")
+    refused = pytest.raises(DataError, match="is not a folder; remove it")
     with refused, checkpoints(tmp_path / "checkpoints"):
         pass
 

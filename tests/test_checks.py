@@ -201,7 +201,8 @@ BROKEN = {
         r"check_task refuses a task that sample_task drew \(no\)",
     ),
     "chance": (
-        changed(step=slips, reset=slips_reset), "says deterministic.*differs at step [1-8] of episode"
+        changed(step=slips, reset=slips_reset),
+        "spec.deterministic is True.*differs at step [1-8] of episode",
     ),
     "paid after the end": (
         told(lambda s, t, a: {"reward": t.terminated.astype(jnp.float32)}),
@@ -232,17 +233,18 @@ BROKEN = {
         type("U", (told(lambda s, t, a: {"goal_reached": t.reward < 1}),), {
             "spec": replace(Track.spec, reward_confirms_goals=True)
         }),
-        "pays a reward without a goal that is reached",
+        "gives a positive reward although no goal is reached",
     ),
     "outcome": (
         told(lambda s, t, a: {"outcome": 0 * t.outcome}),
         r"step [1-5] of episode [0-2] \(the demonstrator's actions\) ends the episode with the best "
         r"return, and its outcome is \[0.0\]; it must be the goal of the task, \[[1-5].0\]",
     ),
-    "vmap": (told(of_batch), "vmap changes the world"),
+    "vmap": (told(of_batch), "vmap changes the results"),
     "jit": (
         told(lambda s, t, a: {"obs": t.obs + (0 if isinstance(s.cell, jax.core.Tracer) else 1)}),
-        "jit changes the world: against the same episode without it, obs differs at step 1 of episode 0",
+        "jit changes the results: compared with running the same episode without jit, obs differs at "
+        "step 1 of episode 0",
     ),
 }  # fmt: skip
 
@@ -279,7 +281,7 @@ def test_chance_that_has_no_part_is_a_note() -> None:
     calm = changed(spec=replace(Track.spec, deterministic=False))
     report = envs.check_world(record(calm()))
     assert report.faults == ()
-    assert "does not say deterministic" in report.notes[0]
+    assert "spec.deterministic is False" in report.notes[0]
 
 
 @pytest.fixture
@@ -306,7 +308,7 @@ def test_the_command_checks_worlds(command) -> None:
     code, out, err = command("test_checks:BAD")
     assert code == 1
     assert "bad-track: 1 fault\n- " in out
-    assert "test_checks:BAD must be mended" in err
+    assert "faults found in test_checks:BAD; fix those listed above before training on it\n" in err
 
 
 BAD = World(name="bad-track", make=told(lambda s, t, a: {"reward": 3 * t.reward}), num_test_tasks=4)

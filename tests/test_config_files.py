@@ -59,7 +59,7 @@ def test_published_results_and_trainings_say_their_settings(tmp_path: Path) -> N
     [
         (None, DataError, "config.json"),
         ("{", DataError, "config.json"),
-        ('{"env": {"a": 1}}', DataError, "no setting 'env' of one value"),
+        ('{"env": {"a": 1}}', DataError, "the setting 'env' in the config file must be a single"),
         ('{"sedes": 1}', UsageError, "unknown flag '--sedes'; did you mean --seeds"),
         ('{"seeds": "many"}', UsageError, "--seeds must be"),
     ],

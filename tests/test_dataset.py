@@ -93,7 +93,7 @@ def test_save_and_load(folder, dataset):
 
 def test_an_existing_folder_is_kept(folder, dataset):
     before = hash_file(folder / ARRAYS)
-    with pytest.raises(DataError, match=r"exists already; remove it or .* --out"):
+    with pytest.raises(DataError, match=r"already exists; remove it or .* --out"):
         save_dataset(folder, make_dataset([1]), {})
     assert hash_file(folder / ARRAYS) == before
 
@@ -636,9 +636,12 @@ def test_damaged_files_of_a_mapped_dataset_are_refused(mapped, damage, says):
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        (b"no array", "obs.npy is no array"),
-        (np.zeros((17, 2), ">f4"), "has the dtype or order >f4"),
-        (np.asfortranarray(np.zeros((17, 2), np.float32)), "has the dtype or order float32"),
+        (b"no array", "obs.npy is not an array"),
+        (np.zeros((17, 2), ">f4"), "wrong dtype or memory order, found >f4, expected float32 in C"),
+        (
+            np.asfortranarray(np.zeros((17, 2), np.float32)),
+            "wrong .* order, found float32 in Fortran order, expected float32 in C",
+        ),
         (np.zeros((16, 2), np.float32), r"obs has shape \[16, 2\], wanted \[step 17, 2\]"),
         (np.full((17, 2), np.nan, np.float32), "obs holds NaN at step 0"),
     ],

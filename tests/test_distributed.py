@@ -225,7 +225,7 @@ def test_a_process_that_is_killed_ends_the_other(place: Path, trained: Path) -> 
     host = socket.gethostname()
     assert (
         line
-        == f"error: process 1 on {host} (process number {number} there) is gone; go on with --resume"
+        == f"error: process 1 on {host} (pid {number}) has ended unexpectedly; continue with --resume"
     )
 
 

@@ -300,7 +300,7 @@ def test_a_file_that_someone_else_wrote_is_no_place_for_a_picture(
     with pytest.raises(UsageError, match="would be overwritten"):
         main(PlotConfig(runs=(run,), out=out))
     assert [path.name for path in out.iterdir()] == ["tiny_learning_curve.png"]
-    with pytest.raises(UsageError, match=r"--out .*is no folder"):
+    with pytest.raises(UsageError, match=r"--out .*is not a folder"):
         main(PlotConfig(runs=(run,), out=run / "summary.json"))
 
 

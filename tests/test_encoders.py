@@ -179,7 +179,7 @@ def test_worlds_without_a_layout_have_no_cells():
 def test_noise_on_codes_is_refused():
     config = coded_config()
     data = replace(DATASET, obs=np.asarray(coded(config.obs_layout, (len(DATASET.obs),))))
-    with pytest.raises(UsageError, match="--obs-noise has no use where --encoder cells"):
+    with pytest.raises(UsageError, match="--obs-noise does not apply to --encoder cells"):
         Trainer(TrainConfig(obs_noise=0.1), config, data, device_mesh(1))
 
 

@@ -141,7 +141,7 @@ def test_the_command_writes_two_models_that_say_what_they_are(tmp_path: Path) ->
         assert facts["world"] == "maze15"
         assert facts["weights_sha256"] == policy.sha256
         assert facts["spec"]["horizon"] == 64
-    with pytest.raises(UsageError, match="exists already"):
+    with pytest.raises(UsageError, match="already exists"):
         main(ExportConfig(out=out))
 
 

@@ -59,7 +59,7 @@ def test_a_failure_leaves_no_folder(tmp_path: Path) -> None:
 
 
 def test_an_existing_folder_is_kept(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="exists already; remove it"), new_folder(tmp_path):
+    with pytest.raises(DataError, match="already exists; remove it"), new_folder(tmp_path):
         raise AssertionError("not reached")
     assert tmp_path.is_dir()
 
@@ -79,7 +79,7 @@ def test_what_is_not_ours_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "folder.partial" / "thesis.txt").write_text("mine")
     with (
         pytest.raises(
-            UsageError, match=r"thesis\.txt is in the way, which is no work of a command"
+            UsageError, match=r"thesis\.txt is in the way and was not written by this command"
         ),
         new_folder(tmp_path / "folder"),
     ):
@@ -182,8 +182,8 @@ def test_a_claim_within_one_process(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("place", "says"),
     [
-        ("file/below", "file is no folder"),
-        ("file/deep/below", "file is no folder"),
+        ("file/below", "file is not a folder"),
+        ("file/deep/below", "file is not a folder"),
         ("x" * 250, "name is too long"),
         ("deep/" + "x" * 300 + "/below", "name is too long"),
     ],

@@ -21,11 +21,11 @@ def test_an_adaptation_is_only_counted(
     adapt.main(parse(AdaptConfig, words.split(), adapt.adapt_default))
     found = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()[2:])
     assert found["searches"] == "50 tasks x 2 seeds x 2 variants"
-    assert found["episodes"] == "8,000 of the searches, 1,000 that judge"  # after 1, 10, .., 40
+    assert found["episodes"] == "8,000 for searching, 1,000 for evaluation"  # after 1, 10, .., 40
     assert found["steps"] == f"at most {9_000 * 64:,}"
     assert found["network"] == "606,853 weights"
     assert "time" in found["CPU"]
-    assert "some " in found["CPU"]
+    assert "about " in found["CPU"]
     assert not (tmp_path / "new").exists()
 
 
@@ -34,7 +34,7 @@ def test_what_was_never_measured_is_not_known(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     adapt.main(parse(AdaptConfig, ["--dry-run"], adapt.adapt_default))
-    assert "not known" in capsys.readouterr().out
+    assert "unknown: no similar run" in capsys.readouterr().out
     assert not list(tmp_path.iterdir())
 
 
@@ -48,5 +48,5 @@ def test_a_training_is_only_counted(
     assert found["network"] == "606,853 weights"  # as the released policy has
     assert found["tokens"] == f"at most {5 + 2 * 64 - 1:,} a trajectory"
     assert "time" in found["CPU"]
-    assert "some " in found["CPU"]
+    assert "about " in found["CPU"]
     assert not list(tmp_path.iterdir())

@@ -24,7 +24,7 @@ def test_worlds_of_one_home_share_a_panel(capsys: pytest.CaptureFixture[str]) ->
     assert [(world.name, others) for world, others in found] == [
         ("maze15", []), ("kitchen", ["kitchen-stock", "kitchen-mjx"]),
     ]  # fmt: skip
-    assert "nowhere:WORLD is left out: cannot load the world" in capsys.readouterr().err
+    assert "skipping nowhere:WORLD: cannot load the world" in capsys.readouterr().err
 
 
 def test_a_world_is_drawn_by_the_first_still_that_it_offers() -> None:
@@ -80,8 +80,8 @@ def test_the_command_leaves_out_what_cannot_be_drawn(
     main(ReproduceConfig(what="figure11", out=tmp_path))
     said = capsys.readouterr().err.splitlines()
     assert said == [
-        "blind is left out: it draws nothing",
-        "absent is left out: it needs a package; install it",
+        "skipping blind: the world draws no pictures",
+        "skipping absent: it needs a package; install it",
         str(tmp_path / "figure11.png"),
     ]
     assert (tmp_path / "figure11.png").stat().st_size > 10_000

@@ -170,7 +170,9 @@ def test_what_does_not_repeat_itself_is_refused() -> None:
     first, _, _ = described.pool.begin(start)
     second, _ = described.pool.advance(start, first, moves[:0], moves[0])
     described.pool.advance(start, second, moves[:1], moves[1])
-    with pytest.raises(DataError, match="does not repeat itself: reset with seed 3 and 1 actions"):
+    with pytest.raises(
+        DataError, match="is not reproducible: after reset with seed 3 and the same 1 actions"
+    ):
         described.pool.advance(start, second, moves[:1], moves[1] + 1)
 
 
@@ -236,7 +238,7 @@ def test_observations_are_joined_and_goals_are_drawn() -> None:
     [
         ({"desired": lambda moment: [1.0]}, r"desired of plane has shape \[1\], achieved has \[2\]"),
         ({"horizon": None}, "no max_episode_steps; say after how many actions"),
-        ({"deterministic": False}, "give options, or leave out deterministic=False"),
+        ({"deterministic": False}, "pass options, or leave out deterministic=False"),
         ({"repeat": 0}, "repeat of plane must be at least 1"),
         ({"make": own_gymnasium.Switches}, "have no achieved_goal; say how to read it"),
         (
@@ -244,7 +246,7 @@ def test_observations_are_joined_and_goals_are_drawn() -> None:
                 Plane(), lambda a: a, gymnasium.spaces.Box(-np.inf, np.inf, (2,)))},
             "a Box with finite bounds",
         ),
-        ({"observe": lambda moment: np.array("far")}, "none that a world can have"),
+        ({"observe": lambda moment: np.array("far")}, "arrays of dtype <U3 are not supported"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_a_world(changes, says) -> None:

@@ -354,7 +354,7 @@ def test_a_run_with_other_weights_or_without_is_another_run(command: Run) -> Non
 def test_the_same_weights_may_lie_elsewhere(command: Run) -> None:
     shutil.move("first/policy", "elsewhere")
     code, text = command(f"{ON} --resume".replace("first/policy", "elsewhere"))
-    assert (code, text) == (0, "on is finished already\n")
+    assert (code, text) == (0, "on is already finished\n")
 
 
 def test_without_a_copy_the_recorded_hash_decides(command: Run) -> None:
@@ -431,7 +431,7 @@ def test_a_folder_of_the_user_is_left_alone(command: Run, mine: str) -> None:
     path.parent.mkdir(parents=True)
     path.write_text("mine")
     code, text = command(ON.replace("--out on", "--out mine"))
-    assert (code, "mine exists already and is no training run" in text) == (2, True), text
+    assert (code, "mine already exists and is not a training run" in text) == (2, True), text
     assert path.read_text() == "mine"
 
 

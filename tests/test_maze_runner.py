@@ -370,7 +370,7 @@ class TestCheckTask:
             *(np.stack(pair) for pair in zip(parse(TINY_MAP), parse(TINY_MAP), strict=True))
         )
         far_and_near.goal[0] = (3, 3)
-        message = "task 1: nobody can solve it in the 9 steps of an episode of short"
+        message = "task 1 cannot be solved within the 9 steps of an episode of short"
         with pytest.raises(ValueError, match=message):
             Silent(**short).check_solvable(far_and_near)
 

@@ -151,7 +151,10 @@ def test_codes_take_no_noise():
         )
 
     Noisy(Coded(), action_noise=0.1)
-    with pytest.raises(ValueError, match="needs amounts, those of echo are codes and counts"):
+    with pytest.raises(
+        ValueError,
+        match="needs quantities on a continuous scale, but those of echo are codes and counts",
+    ):
         Noisy(Coded(), obs_noise=0.1)
 
 

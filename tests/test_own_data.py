@@ -253,7 +253,7 @@ def test_goals_by_a_function_of_observations_or_of_an_episode(monkeypatch):
         ),
         ("broken", DataError, "episode 0: --goal my_goals:broken raised KeyError: 'door'"),
         ("nothing", UsageError, "my_goals:nothing cannot be loaded: .* has no attribute"),
-        ("NUMBER", UsageError, "my_goals:NUMBER is no function, found 3"),
+        ("NUMBER", UsageError, "my_goals:NUMBER is not a function, found 3"),
     ):
         with pytest.raises(error, match=says):
             imported("logs.npz", "never", goal=f"my_goals:{name}")
@@ -318,7 +318,7 @@ def no_actions(episodes):
     [
         (
             nan_in_the_second,
-            r"run_1.npz, step 1: obs holds NaN or infinity; mend it, or .* --skip-bad",
+            r"run_1.npz, step 1: obs holds NaN or infinity; fix it, or .* --skip-bad",
         ),
         (three_too_many, r"run_1.npz has 5 observations and 2 actions; .* T \+ 1 observations"),
         (another_shape, r"run_2.npz: obs has rows of float32\[4\], those before have float32\[3\]"),
@@ -347,7 +347,10 @@ def test_bad_episodes_can_be_left_out():
     ("settings", "says"),
     [
         ({}, "nothing says what a goal is; give --goal-columns with some of the 3 components"),
-        ({"goal_columns": (3,)}, "--goal-columns 3 is none of the 3 components"),
+        (
+            {"goal_columns": (3,)},
+            "--goal-columns 3 is out of range: observations have 3 components",
+        ),
         (
             {"goal_array": "goals"},
             "episode 0 has no array named 'goals'; give --goal-array one of actions, ",
@@ -359,7 +362,10 @@ def test_bad_episodes_can_be_left_out():
         ),
         ({"goal_columns": (0, 0)}, "names a component twice"),
         ({"goal": "half"}, "as module:function, found 'half'"),
-        ({"goal_columns": (0,), "action_low": (0.0,)}, "must have as many numbers"),
+        (
+            {"goal_columns": (0,), "action_low": (0.0,)},
+            "must have the same number of values, found 0.0 and none",
+        ),
         ({"goal_columns": (0,), "action_low": (1.0,), "action_high": (1.0,)}, "must be below"),
         (
             {"goal_columns": (0,), "action_low": (-1.0,) * 3, "action_high": (1.0,) * 3},
@@ -386,7 +392,7 @@ def test_settings_that_do_not_fit_the_logs(settings, says):
         ({"x": np.zeros(2)}, "lacks actions; it has x"),
         (
             {"actions": np.zeros((3, 1)), "observations": np.zeros((3, 1))},
-            "neither terminals, timeouts",
+            "has no terminals, timeouts or lengths",
         ),
         ({"actions": np.zeros((3, 1)), "lengths": np.array([1, 1])}, "add up to 2 steps, found 3"),
         (
@@ -405,7 +411,7 @@ def test_flat_files_whose_episodes_nobody_can_tell(arrays, says):
     ("source", "says"),
     [
         ("nowhere.npz", "no file"),
-        ("logs.txt", "is no file that can be imported"),
+        ("logs.txt", "is not a file that can be imported"),
         ("empty", "holds neither"),
     ],
 )
@@ -597,9 +603,9 @@ def test_the_command_from_logs_to_logs(capsys):
     assert call(capsys, "export mine --out again.npz")[0] == 0
     before = {path: hash_file(path) for path in Path().rglob("*") if path.is_file()}
     for line, code, says in (
-        ("import walk.npz --goal-columns 0 --out mine", 2, "mine exists already"),
-        ("export mine --out again.npz", 2, "again.npz exists already"),
-        ("export mine --out mine", 2, "mine exists already"),
+        ("import walk.npz --goal-columns 0 --out mine", 2, "mine already exists"),
+        ("export mine --out again.npz", 2, "again.npz already exists"),
+        ("export mine --out mine", 2, "mine already exists"),
         ("export mine", 2, "--out is missing"),
         ("check nowhere", 2, "there is no folder nowhere"),
         ("check .", 1, "no dataset in ."),
@@ -637,7 +643,10 @@ def test_the_guide_makes_and_checks_its_example(capsys):
     for text in ("200 trajectories of 29 to 29 steps, 5800 in all", "no faults"):
         assert text in said
         assert text in " ".join(GUIDE.read_text().split())
-    assert "200 episodes have no observation after their last action" in said
+    assert (
+        "200 episodes have no observation after their last action, so that action was dropped"
+        in said
+    )
 
 
 @pytest.mark.slow

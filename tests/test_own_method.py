@@ -107,8 +107,8 @@ def test_its_settings_are_in_the_help(adapt: Run) -> None:
         ("--thrift -1", "--thrift must be at least 0, found -1"),
         ("--thrift inf", "--thrift must be a finite number, found inf"),
         ("--thrift much", "--thrift must be a number, found 'much'"),
-        ("--c 2", "--c is no setting of lucky; it is one of ucb"),
-        ("--keep-rewarded", "is no setting of lucky; it is one of ucb, bpe, explore"),
+        ("--c 2", "--c is not a setting of lucky; it belongs to ucb"),
+        ("--keep-rewarded", "is not a setting of lucky; it belongs to ucb, bpe, explore"),
         (
             "--method own_method:LuckyHyper",
             "own_method:LuckyHyper is a type; the place of a method must",

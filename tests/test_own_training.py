@@ -102,16 +102,17 @@ def test_a_mapped_and_a_packed_dataset_train_the_same_weights(here):
 def test_a_finished_run_takes_more_steps_and_a_new_one_starts_from_its_weights(here, capsys):
     before = read_policy(Path("first/policy")).sha256
     assert pretrain(f"{BASE} --out first --resume") == 0
-    assert "is finished already" in capsys.readouterr().err
+    assert "is already finished" in capsys.readouterr().err
     more = BASE.replace("--steps 4", "--steps 6")
     assert pretrain(f"{more} --out first") == 2
-    assert "exists already" in capsys.readouterr().err
+    assert "already exists" in capsys.readouterr().err
     assert pretrain(f"{more} --seed 1 --out first --resume") == 2  # only the steps may grow
     capsys.readouterr()
     assert pretrain(f"{more} --out first --resume") == 0
     said = capsys.readouterr().err
     assert (
-        "the run has 4 steps and goes on to 6: the learning rate is that of a training of 6" in said
+        "the run has 4 steps and continues to 6: the learning rate is that of a training of 6"
+        in said
     )
     assert "resuming first at step 4" in said
     assert read_policy(Path("first/policy-4")).sha256 == before
@@ -121,7 +122,7 @@ def test_a_finished_run_takes_more_steps_and_a_new_one_starts_from_its_weights(h
     ]
     assert rows == [2, 4, 6]
     assert pretrain(f"{more} --out first --resume") == 0
-    assert "is finished already" in capsys.readouterr().err
+    assert "is already finished" in capsys.readouterr().err
     assert pretrain(f"{BASE} --out first --resume") == 2  # fewer steps are other settings
     capsys.readouterr()
     assert (
@@ -129,7 +130,7 @@ def test_a_finished_run_takes_more_steps_and_a_new_one_starts_from_its_weights(h
         == 0
     )
     assert (
-        "schedule: 4 steps of 8 trajectories, which sees the data 1.8 times"
+        "schedule: 4 gradient steps of 8 trajectories, which is 1.8 epochs;"
         in capsys.readouterr().err
     )
     on = read_policy(Path("on/policy"))
@@ -154,8 +155,8 @@ def test_a_run_that_was_killed_while_it_took_more_steps_can_go_on(here, monkeypa
 WRONG = {
     "--env none": "--env none is for data of your own",
     "--data nowhere": "no dataset in nowhere",
-    "--data mine --demonstrator expert": "--demonstrator has no use beside it",
-    "--data mine --data-seed 1": "--data-seed has no use beside it",
+    "--data mine --demonstrator expert": "so --demonstrator does not apply to it",
+    "--data mine --data-seed 1": "so --data-seed does not apply to it",
     "--data mine --method ptgm": "--method ptgm needs a world",
     "--data mine --trajectories 21": "--trajectories 21 is more than the 20 in mine",
     "--data mine --holdout 20": "--holdout 20 leaves nothing of 20 trajectories",
@@ -262,7 +263,7 @@ def test_what_was_chosen_is_printed_and_flags_change_it(here):
     assert "--embed-dim 64" in text
     assert "--steps 100" in text
     assert "--standardize-obs" in text
-    assert schedule(config).endswith("rises to 0.003 in 50 steps and stays there")
+    assert schedule(config).endswith("rises to 0.003 within 50 steps and then stays constant")
     assert config.folder == Path("runs/pretrain/mine/fast-seed0")
 
 

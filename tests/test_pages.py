@@ -322,8 +322,8 @@ def test_pictures_and_videos_stand_below(tmp_path: Path, result: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "content", "says"),
     [
-        ("a.png", b"<svg>", "is no picture that a page can show"),
-        ("a.svg", b"<svg>", "is no picture that a page can show"),
+        ("a.png", b"<svg>", "is not a picture that a page can show"),
+        ("a.svg", b"<svg>", "is not a picture that a page can show"),
         ("a.gif", b"GIF89a" + bytes(4_000_000), "4.0 MB, a page 5 MB at most"),
         ("none.gif", None, "cannot be read: No such file"),
     ],
@@ -428,7 +428,10 @@ def test_weights_that_half_precision_cannot_hold_are_refused() -> None:
 
 
 def test_a_world_without_rules_has_no_playground() -> None:
-    with pytest.raises(UsageError, match="no rules for a page"):
+    with pytest.raises(
+        UsageError,
+        match=r"no playground can be made of .*World\.page\) does not implement the rules",
+    ):
         world_data(PLAIN, load_policy(MAZE15))
     assert page_of(World(name="none", make=PLAIN.make)).script is None
 

@@ -154,7 +154,7 @@ def test_a_record_that_a_plan_does_not_come_to_is_named(maze: Any, grid: Any) ->
         goals = results.best["prompt.goals"].copy()
         goals[place] = goals[place][::-1]
         changed = replace(results, best={**results.best, "prompt.goals": goals})
-        with pytest.raises(DataError, match="other prompts than those on record"):
+        with pytest.raises(DataError, match="gives different prompts from the recorded ones"):
             plan_of(changed)
     with pytest.raises(DataError, match="hold no actions"):
         plan_of(replace(maze[0], actions=None))
@@ -241,7 +241,7 @@ def test_an_estimate_is_that_of_a_gaussian_process(worths: Results) -> None:
             found = arrays[name][seed, task, episode, : len(distinct)]
             np.testing.assert_allclose(found, wanted[distinct], atol=1e-4)
     goals = worths.best["prompt.goals"] + np.float32(0.5)
-    with pytest.raises(DataError, match="other prompts than those on record"):
+    with pytest.raises(DataError, match="gives different prompts from the recorded ones"):
         plan_of(replace(worths, best={**worths.best, "prompt.goals": goals}))
 
 

@@ -180,7 +180,7 @@ def test_a_recipe_is_never_mixed(words: list[str]):
         ("--env=", "--env must not be empty, found ''"),
         ("--demonstrator=", "--demonstrator must not be empty, found ''"),
         ("--debug=yes", "--debug takes no value, found 'yes'"),
-        ("--debug yes", "no flag takes the word 'yes'; see mgpo pretrain --help"),
+        ("--debug yes", "unexpected argument 'yes'; see mgpo pretrain --help"),
         ("--tyro-print-completion bash", "unknown flag '--tyro-print-completion'"),
     ],
 )
@@ -211,8 +211,8 @@ def test_any_text_is_a_number_or_refused(text: str):
         (EvaluateConfig, "x --env=", "--env must not be empty, found ''"),
         (PlotConfig, "x --tasks 0 -1", "--tasks must be at least 0, found (0, -1)"),
         (PlotConfig, "x --seed -1", "--seed must be at least 0, found -1"),
-        (CollectConfig, "x", "no flag takes the word 'x'"),
-        (ReproduceConfig, "table4 table5", "no flag takes the word 'table5'"),
+        (CollectConfig, "x", "unexpected argument 'x'"),
+        (ReproduceConfig, "table4 table5", "unexpected argument 'table5'"),
         (ReproduceConfig, "--what table4", "unknown flag '--what'"),
     ],
 )
@@ -271,8 +271,8 @@ def test_settings_that_do_not_go_together(line: str, says: str, tmp_path, monkey
     ("config", "says"),
     [
         (ReproduceConfig(), "no table given; name one of table1, table2"),
-        (ReproduceConfig(what="table4", only=("K1",)), "table4 has no use for --only"),
-        (ReproduceConfig(what="table4", steps=3), "table4 has no use for --steps"),
+        (ReproduceConfig(what="table4", only=("K1",)), "--only K1 does not apply to table4"),
+        (ReproduceConfig(what="table4", steps=3), "--steps 3 does not apply to table4"),
         (ReproduceConfig(what="figure8", trajectories=40), "--trajectories must be above 200"),
     ],
 )

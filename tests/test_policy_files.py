@@ -121,7 +121,7 @@ def test_standardization_comes_back(tmp_path: Path, params: dict) -> None:
         ({"tokens_per_step": 3}, "network.tokens_per_step must be 2 or 1, found 3"),
         ({"tokens_per_step": "1"}, "network.tokens_per_step must be 2 or 1, found '1'"),
         ({"encoder": "cells"}, "network.obs_layout must not be null with encoder cells"),
-        ({"obs_layout": LAYOUT}, "network.obs_layout is of no use to encoder linear"),
+        ({"obs_layout": LAYOUT}, "network.obs_layout does not apply to encoder linear"),
         ({"obs_layout": {"num_cells": 2}}, "lacks network.obs_layout.code_sizes"),
         ({"obs_layout": {**LAYOUT, "more": 1}}, "has the unknown entry network.obs_layout.more"),
         (
@@ -338,7 +338,9 @@ def test_a_killed_exchange_of_policies_is_mended(
 
 def test_weights_that_are_not_finite_are_not_written(tmp_path: Path, params: dict) -> None:
     broken = jax.tree.map(lambda leaf: leaf * jnp.nan, params)
-    with pytest.raises(DataError, match=r"policy is not written: weight params/.* holds NaN"):
+    with pytest.raises(
+        DataError, match=r"policy was not saved to .*policy: the weight params/.* holds NaN"
+    ):
         save_policy(tmp_path / "policy", CONFIG, broken, {})
     assert not list(tmp_path.iterdir())
 
@@ -351,7 +353,7 @@ def test_wrong_shape(policy: Path) -> None:
 
 def test_foreign_weight(policy: Path) -> None:
     rewrite(policy, **{"params/tail/bias": np.zeros(4, np.float32)})
-    with pytest.raises(DataError, match="params/tail/bias is foreign"):
+    with pytest.raises(DataError, match="has the unexpected array params/tail/bias"):
         read_policy(policy)
 
 

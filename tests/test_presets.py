@@ -44,7 +44,9 @@ def test_a_record_cannot_take_the_name_of_another(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     assert envs.find("named_alike:SAME") is envs.find("maze15")
-    with pytest.raises(UsageError, match="has the name of the world 'maze15'; give it another"):
+    with pytest.raises(
+        UsageError, match="has the name 'maze15', which another world already has; rename it"
+    ):
         envs.find("named_alike:THIEF")
 
 
@@ -55,7 +57,7 @@ def test_a_broken_plug_in_breaks_only_itself():
     with pytest.raises(UsageError, match="cannot load the method"):
         METHODS.find("broken")
     ucb = METHODS.find("ucb")
-    with pytest.raises(UsageError, match="--std-init is no setting of ucb; it is one of bbt"):
+    with pytest.raises(UsageError, match="--std-init is not a setting of ucb; it belongs to bbt"):
         ucb.hyper_from({"std_init": 1.0})
 
 

@@ -156,7 +156,7 @@ def test_one_process_needs_nobody() -> None:
 @pytest.mark.parametrize(
     ("flags", "says"),
     [
-        ({"processes": 2}, "--processes 2 is for several processes; add --distributed"),
+        ({"processes": 2}, "--processes 2 only works with --distributed; add --distributed"),
         ({"distributed": True, "coordinator": "a:1"}, "--coordinator needs --processes beside it"),
         (
             {"distributed": True, "coordinator": "a", "processes": 2, "process": 0},
@@ -164,7 +164,7 @@ def test_one_process_needs_nobody() -> None:
         ),
         (
             {"distributed": True, "coordinator": "a:1", "processes": 2, "process": 2},
-            "--process counts from 0: of 2 processes the last is 1, found 2",
+            "--process must be from 0 to 1, since there are 2 processes, found 2",
         ),
     ],
 )

@@ -98,11 +98,11 @@ def test_a_release_that_breaks_off_leaves_nothing(
 def test_the_card_names_the_policy_that_a_training_began_from(run: Path, release: Release) -> None:
     card = run.with_name("packed") / "README.md"
     assert release()[0] == 0
-    assert "began from" not in card.read_text()
+    assert "initialized from" not in card.read_text()
     shutil.rmtree(card.parent)
     configured(config=CONTINUED, init_sha256="0a" * 32)(run)
     assert release()[0] == 0
-    row = f"| began from | the weights of the policy the/first\\n, SHA-256 {'0a' * 32} |"
+    row = f"| initialized from | the weights of the policy the/first\\n, SHA-256 {'0a' * 32} |"
     assert row in card.read_text().splitlines()
 
 
@@ -113,8 +113,8 @@ def test_the_card_tells_how_that_policy_was_trained(run: Path, release: Release)
     assert release()[0] == 0
     before = PretrainConfig(env="gridworld")
     row = (
-        f"| which had seen | {before.train.steps:,} steps of {before.train.batch_size} trajectories, "
-        f"{before.data.trajectories:,} demonstrations, seed 0; began from "
+        f"| that policy was trained for | {before.train.steps:,} steps of {before.train.batch_size} "
+        f"trajectories, {before.data.trajectories:,} demonstrations, seed 0; initialized from "
         f"the weights of the policy the/first\\n, SHA-256 {'0b' * 32} |"
     )
     assert row in (run.with_name("packed") / "README.md").read_text().splitlines()

@@ -108,7 +108,7 @@ def test_results_without_what_may_be_missing_survive_the_disk(tmp_path: Path) ->
 def test_results_are_never_overwritten(tmp_path: Path) -> None:
     folder = save(tmp_path / "run", made_results())
     before = (folder / "results.npz").read_bytes()
-    with pytest.raises(DataError, match="run exists already"):
+    with pytest.raises(DataError, match="run already exists"):
         save_results(folder, made_results("bpe"))
     assert (folder / "results.npz").read_bytes() == before
 
@@ -389,7 +389,7 @@ def test_a_policy_is_found_where_it_was_moved_with_its_results(
     assert load_policy_of(loaded, TINY).folder.resolve() == (tmp_path / "new/policy").resolve()
     (tmp_path / "new/policy").rename(tmp_path / "mine")
     with pytest.raises(
-        DataError, match=r"are not those .*; give the folder .*by --policy|--policy"
+        DataError, match=r"are not those .*: give the folder of the policy .*, using --policy"
     ):
         load_policy_of(loaded, TINY)
     assert load_policy_of(loaded, TINY, tmp_path / "mine").sha256 == sha256
@@ -571,7 +571,7 @@ def test_summaries_are_of_the_results() -> None:
     assert text.splitlines()[0] == "tiny, ucb: 2 tasks x 2 seeds x 20 episodes"
     assert "regret           0.850 ± 0.250" in text
     assert "solved optimally 25 %" in text
-    assert "broke down" not in text
+    assert "failed" not in text
 
 
 def test_regret_after_40_is_unknown_where_nothing_was_judged_then() -> None:
@@ -605,7 +605,9 @@ def test_parts_that_were_done_are_counted_and_printed(tmp_path: Path) -> None:
     shares = [(1.0, 4), (0.75, 4), (0.75, 4), (1.0, 2), (1.0, 2), (1.0, 2), (0.5, 2)]
     assert loaded.summary["part_shares"] == shares
     lines = printed(loaded.summary).splitlines()
-    first = lines.index("parts in order   share with the first k done (tasks x seeds that have k)")
+    first = lines.index(
+        "parts in order   share of searches that did the first k parts (searches with at least k parts)"
+    )
     assert lines[first + 1] == "  p1             1.00 (4)"
     assert lines[first + 7] == "  p7             0.50 (2)"
     assert lines[first + 8].startswith("speed")
@@ -635,7 +637,7 @@ def test_a_world_that_is_not_rewarded_in_parts_has_none(tmp_path: Path) -> None:
 
 
 def test_episodes_of_broken_worlds_are_printed() -> None:
-    assert "failed episodes  3 (the world broke down)" in printed(
+    assert "failed episodes  3 (the simulation failed)" in printed(
         {**summary_of(made_results()), "failed_episodes": 3}
     )
 

@@ -52,7 +52,7 @@ def unpublished(monkeypatch: pytest.MonkeyPatch) -> list[Noise]:
 
     def opened(folder: Path, env: None, sizes: Sequence[Noise]) -> Any:
         if sizes[0].obs == "official":
-            raise UsageError("this world has no official program")
+            raise UsageError("this world has no official implementation")
         return sizes[0]
 
     def evaluated(cases: Sequence[Any], episodes: int, seed: int) -> Iterator[dict[str, Any]]:
@@ -79,7 +79,7 @@ def test_missing_rows_are_measured_once(unpublished: list[Noise], tmp_path: Path
     assert [row[2] for row in rows] == [str(noise) for noise in robustness.SIZES]
     official, weak, *_, strong = rows
     assert official[3:] == ["0.49 (-0.14)", *["-"] * 5]
-    assert "- kitchen: this world has no official program" in text
+    assert "- kitchen: this world has no official implementation" in text
     assert strong[3] == "0.30 (-0.33)"  # the paper's number for actions
     assert weak[4:6] == ["0.433 ± 0.010", "-0.500"]
     assert float(weak[6]) == pytest.approx(0.433 - 0.49, abs=1e-3)

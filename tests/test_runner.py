@@ -539,13 +539,13 @@ def test_methods_say_what_they_cannot_do(tasks):
     run = partial(adapt, MAZE, untrained(MAZE), tasks)
     with pytest.raises(UsageError, match="--max-goals 4 is longer than the policy's prompts"):
         run("ucb", {"max_goals": 4})
-    with pytest.raises(UsageError, match="--num-edits is no setting of ucb"):
+    with pytest.raises(UsageError, match="--num-edits is not a setting of ucb"):
         run("ucb", {"num_edits": 4})
     with pytest.raises(UsageError, match="did you mean 'grips'"):
         run("grip")
     with pytest.raises(UsageError, match="point draws no goals at random"):
         adapt(Point(), untrained(Point()), sample_tasks(Point(), 5, 1), "grips")
-    with pytest.raises(UsageError, match="scale cannot differ between the variants"):
+    with pytest.raises(UsageError, match="scale cannot be swept, because it changes"):
         sweep(MAZE, untrained(MAZE), tasks, UCB, [UcbHyper(), UcbHyper(scale=1.0)])
 
 
@@ -553,7 +553,9 @@ def test_methods_say_what_they_cannot_do(tasks):
     "changes", [{"episodes": 0}, {"temperature": 0.0}, {"temperature": float("nan")}]
 )
 def test_judgements_that_say_nothing(changes):
-    with pytest.raises(UsageError, match="judged at a temperature above 0 in at least one episode"):
+    with pytest.raises(
+        UsageError, match="needs a finite temperature above 0 and at least one episode"
+    ):
         Judgement("sample", **changes)
 
 

@@ -148,7 +148,7 @@ DAMAGED = {
 @pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
 def test_claims_are_compared_with_the_file(path: Path, name: str, method: int) -> None:
     packed(path, CLAIMS[name], method)
-    assert f"{path}: maze claims shape [" in refused(path)
+    assert f"{path}: maze declares shape [" in refused(path)
 
 
 @pytest.mark.parametrize("name", DAMAGED)
@@ -165,7 +165,7 @@ def test_other_compression(path: Path, method: int) -> None:
 
 def test_two_members_of_one_name(path: Path) -> None:
     packed(path, npy(), times=2)
-    assert "maze is there twice" in refused(path)
+    assert "maze occurs twice" in refused(path)
 
 
 def test_encrypted_members(path: Path) -> None:
@@ -242,7 +242,7 @@ def test_missing_and_foreign_arrays(path: Path) -> None:
     assert f"{path} lacks goal" in refused(path)
     np.savez(path, maze=MAZE, goal=GOAL, more=np.array([{}]))
     assert "more" not in read_arrays(path, FIELDS)
-    assert ": more is foreign" in refused(path, only=True)
+    assert " has the unexpected array more" in refused(path, only=True)
 
 
 def test_sizes_that_are_known(path: Path) -> None:

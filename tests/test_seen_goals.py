@@ -201,7 +201,7 @@ def far_of(method: str) -> list[bool]:
     found = report_data({folder: load_results(folder)}, [read_row(folder)])
     (run,) = found["runs"]
     arrays = unpacked(run["arrays"])
-    assert ("far from training", far_prompts(load_results(folder))) in run["facts"]
+    assert ("prompts far from training goals", far_prompts(load_results(folder))) in run["facts"]
     rows = arrays["prompts"][arrays["best"][:, :, -1]].astype(int)
     return list(((rows > 0) & (arrays["far"][rows - 1] == 1)).any(axis=-1).ravel())
 

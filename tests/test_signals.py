@@ -63,7 +63,9 @@ print("its own way", flush=True)
 """
     )
     assert (code, out) == (0, "0\nTrue\nits own way\n")
-    assert err == "stopping soon; a second request ends it at once\n"
+    asked = "finishing the current step and saving a checkpoint"
+    again = "press Ctrl-C (or send the signal) again to stop at once"
+    assert err == f"{asked}; {again}\n"
 
 
 def test_the_second_request_ends_it() -> None:

@@ -56,7 +56,7 @@ def test_words_are_crossed() -> None:
         ("--sweep c=1,a", "--c must be a number, found 'a'"),
         ("--sweep max_gaols=1", "did you mean 'max_goals'"),
         ("--method bbt --sweep population_size=4,8", "run adapt once for each value"),
-        ("--method gcbc --sweep c=1", "c is no setting of gcbc"),
+        ("--method gcbc --sweep c=1", "c is not a setting of gcbc"),
     ],
 )
 def test_what_is_no_sweep_is_refused(words: str, says: str) -> None:

@@ -211,12 +211,12 @@ FALSE_SHARES = {
 def test_parts_are_those_of_the_results(with_parts: Path, name: str) -> None:
     assert read_row(with_parts).summary["part_shares"] == [tuple(pair) for pair in SHARES]
     change(with_parts / "summary.json", part_shares=FALSE_SHARES[name])
-    with pytest.raises(DataError, match=r"part_shares is .*, by results\.npz it is 1, 75, 0\.89"):
+    with pytest.raises(DataError, match=r"part_shares is .*, but results\.npz gives 1, 75, 0\.89"):
         read_row(with_parts)
 
 
 def test_parts_need_single_episodes_and_their_numbers(with_parts: Path) -> None:
-    says = r"part_shares is 1, 75, .*, by results\.npz it is unknown; adapt again"
+    says = r"part_shares is 1, 75, .*, but results\.npz gives unknown; adapt again"
     change(with_parts / "config.json", eval_episodes=10)
     with pytest.raises(DataError, match=says):
         read_row(with_parts)
@@ -386,7 +386,7 @@ CONTRADICTIONS = {
 def test_a_summary_of_other_results_is_refused(copied: Path, name: str) -> None:
     value = CONTRADICTIONS[name]
     change(copied / "summary.json", **{name: value})
-    with pytest.raises(DataError, match=rf"summary\.json: {name} is .*, by results\.npz it is"):
+    with pytest.raises(DataError, match=rf"summary\.json: {name} is .*, but results\.npz gives"):
         read_row(copied)
 
 
@@ -401,7 +401,7 @@ def test_an_optimum_is_that_of_the_results(copied: Path) -> None:
         regret_after_40=0.0,
         solved_optimally=1.0,
     )
-    with pytest.raises(DataError, match=r"optimal_return is .*, by results\.npz it is -0\.072"):
+    with pytest.raises(DataError, match=r"optimal_return is .*, but results\.npz gives -0\.072"):
         read_row(copied)
 
 
@@ -414,7 +414,7 @@ def test_the_share_solved_allows_for_tasks_that_nobody_can_solve(copied: Path) -
     with pytest.raises(DataError, match=r"solved_optimally is 0\.6766"):
         read_row(copied)
     change(copied / "summary.json", unsolvable_tasks=40, solved_optimally=share)
-    with pytest.raises(DataError, match=r"solved_optimally is .*, by results\.npz it is 0\.2"):
+    with pytest.raises(DataError, match=r"solved_optimally is .*, but results\.npz gives 0\.2"):
         read_row(copied)
 
 
@@ -429,12 +429,14 @@ def test_optimum_and_solved_are_known_together(copied: Path) -> None:
         ("optimal_return", "regret", "regret_after_40", "regret_std_over_seeds")
     )
     change(copied / "summary.json", **unknown)
-    with pytest.raises(DataError, match=r"optimal_return is unknown, by results\.npz it is"):
+    with pytest.raises(DataError, match=r"optimal_return is unknown, but results\.npz gives"):
         read_row(copied)
     with np.load(copied / "results.npz") as file:
         arrays = {name: array for name, array in file.items() if name != "optimal_returns"}
     np.savez(copied / "results.npz", **arrays)
-    with pytest.raises(DataError, match=r"solved_optimally is 0\.7266.*, .* it is unknown"):
+    with pytest.raises(
+        DataError, match=r"solved_optimally is 0\.7266.*, but results\.npz gives unknown"
+    ):
         read_row(copied)
     change(copied / "summary.json", solved_optimally=None)
     assert cells(read_row(copied))["solved optimally"] == ""
@@ -508,7 +510,7 @@ def test_worlds_judged_by_sampling_have_a_lucky_and_a_fresh_return(lucky: Path) 
     assert re.search(r"fresh +-0\.250 \(the final return, of 4 sampled episodes", text)
     assert re.search(r"minus initial +1\.750 \[1\.500, 2\.000\] \(95 % over tasks\)", text)
     change(lucky / "summary.json", fresh={**fresh, "gain": 3.0})
-    with pytest.raises(DataError, match=r"gain is 3, by results\.npz it is 1\.75"):
+    with pytest.raises(DataError, match=r"gain is 3, but results\.npz gives 1\.75"):
         read_row(lucky)
 
 
@@ -529,7 +531,7 @@ def test_named_goals_are_counted(lucky: Path) -> None:
     assert re.search(r"score +50\.24 \(initially 50\.24\)", text)
     assert re.search(r"down +25\.0 % \(initially 25\.0 %\)", text)
     change(lucky / "summary.json", achieved={"down": [0.25, 0.3], "right": [1.0, 1.0]})
-    says = r"achieved is 0\.25, 0\.3, 1, 1, by results\.npz it is 0\.25, 0\.25, 1, 1"
+    says = r"achieved is 0\.25, 0\.3, 1, 1, but results\.npz gives 0\.25, 0\.25, 1, 1"
     with pytest.raises(DataError, match=says):
         read_row(lucky)
     change(lucky / "summary.json", achieved=...)

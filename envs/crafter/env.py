@@ -87,7 +87,10 @@ class Crafter(Environment):
 
     def __post_init__(self) -> None:
         if self.pixels and self.places:
-            raise UsageError("a picture does not say where the agent is; choose pixels or places")
+            raise UsageError(
+                "pixels and places cannot be combined: a picture does not show where on the map the agent "
+                "is; choose one of them"
+            )
 
     @property
     def spec(self) -> EnvSpec:

@@ -43,7 +43,7 @@ def load_page(env: GridWorld) -> Page:
 GRIDWORLD = World(
     name="gridworld",
     make=make,
-    summary="switch on 3 to 7 objects on a 10 x 10 grid in an order that is not told",
+    summary="switch on 3 to 7 objects on a 10 x 10 grid in a hidden order",
     demonstrators=load_demonstrators,
     presets={
         # Each of the 13,600 training tasks five times.

@@ -204,9 +204,9 @@ export const world = {
       `${moments.length - 1} steps; on: ${on.join(", ") || "none"}; ${last.numSolved} of ${task.length} in order.`;
   },
   legend: [
-    ["target", "full: on"],
-    ["ink", "small number: place in the hidden order"],
-    ["prompt", "place in the prompt"],
+    ["target", "filled disc: switched on"],
+    ["ink", "small number: position in the true order"],
+    ["prompt", "number: position in the prompt"],
     ["agent", "ring and line: agent and its path"],
   ],
   spots: ({ side }) => [side, side],

@@ -86,7 +86,7 @@ def load_official(env: Kitchen) -> Official:
 KITCHEN = World(
     name="kitchen",
     make=make,
-    summary="a robot arm completes 1 to 5 subtasks in a kitchen in an order that is not told",
+    summary="a robot arm completes 1 to 5 subtasks in a kitchen in a hidden order",
     demonstrators=load_demonstrators,
     presets={
         # Trajectories are long, so 32 of them are enough for a gradient step.

@@ -1,4 +1,4 @@
-"""FrankaKitchen of gymnasium-robotics, the official program that the kitchen re-implements."""
+"""FrankaKitchen of gymnasium-robotics, the official implementation by others."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ def learning_curves(results: Mapping[str, Mapping[str, Results]]) -> Figure:
     panels = figure.subplots(1, len(results), squeeze=False)[0]
     for ax, (world, of_world) in zip(panels, results.items(), strict=True):
         _draw_curves(ax, of_world, world)
-        ax.set_ylabel("" if ax is not panels[0] else "judged return")
+        ax.set_ylabel("" if ax is not panels[0] else "return of the optimized prompt")
     entries = {
         label: line
         for ax in panels
@@ -117,7 +117,7 @@ def training_curve(rows: Sequence[Mapping[str, Any]]) -> Figure:
     steps = [row["step"] for row in rows]
     figure = Figure(figsize=(6.4, 2.4), layout="constrained")
     panels = (
-        ("loss", {"train/loss": "training", "val/loss": "held out"}),
+        ("loss (nats per action)", {"train/loss": "training", "val/loss": "validation"}),
         (
             "return",
             {
@@ -135,6 +135,6 @@ def training_curve(rows: Sequence[Mapping[str, Any]]) -> Figure:
             if any(name in row for row in rows):
                 values = [row.get(name, np.nan) for row in rows]
                 ax.plot(steps, values, color=color, label=label, marker="o", markersize=3)
-        ax.set(xlabel="steps", ylabel=ylabel)
+        ax.set(xlabel="gradient steps", ylabel=ylabel)
         ax.legend()
     return figure

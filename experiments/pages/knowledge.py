@@ -80,10 +80,10 @@ def knowledge_of(results: Results) -> Knowledge | None:
 
 
 def disagreement(results: Results) -> DataError:
-    """The error for a method that, told the recorded episodes, does not arrive at the recorded prompts."""
+    """The error for a method that, given the recorded episodes, does not arrive at the recorded prompts."""
     return DataError(
-        f"{results.method}, told the recorded episodes, acts with other prompts than those on record: "
-        "they were made by another version"
+        f"replaying the recorded episodes with {results.method} gives different prompts from the recorded "
+        "ones: the results were made by another version"
     )
 
 

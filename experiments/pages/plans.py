@@ -74,7 +74,9 @@ def plan_of(results: Results) -> Arrays:
     adapter, state = found
     models = MapState, OrderState, WorthState
     if isinstance(state, models) and results.episodes_used is not None:
-        raise DataError("what a plan knew is not shown of searches that ended early (--stop-at)")
+        raise DataError(
+            "what the optimizer knew cannot be shown for searches that ended early (--stop-at)"
+        )
     if isinstance(state, MapState):
         return _map_arrays(results, adapter)
     if isinstance(state, OrderState):
@@ -84,7 +86,7 @@ def plan_of(results: Results) -> Arrays:
 
 def _map_arrays(results: Results, adapter: Adapter) -> Arrays:
     if results.actions is None:
-        raise DataError("these results hold no actions, from which a map could be drawn again")
+        raise DataError("the map cannot be rebuilt, because these results hold no actions")
     spec = results.environment.spec
 
     def read(state: MapState) -> Any:

@@ -45,12 +45,13 @@ def world_data(world: World, policy: LoadedPolicy) -> dict[str, Any]:
     page, spec, network = page_of(world), world.make().spec, policy.config
     if page.script is None or page.track is not None:
         raise UsageError(
-            f"{world.name} has no rules for a page, so that no playground can be made of it"
+            f"no playground can be made of {world.name}: its page (World.page) does not implement the "
+            "rules of the world"
         )
     if network.head != "categorical" or network.encoder != "linear":
         raise UsageError(
             f"the policy of {world.name} has the head {network.head} and the encoder {network.encoder}; a "
-            "playground runs categorical and linear"
+            "playground supports only the head categorical with the encoder linear"
         )
     return {
         "name": world.name,

@@ -97,7 +97,9 @@ def _picture(path: Path) -> dict[str, str]:
     except OSError as error:
         raise UsageError(f"the picture {path} cannot be read: {error.strerror}") from None
     if begins is None or not content.startswith(begins):
-        raise UsageError(f"{path} is no picture that a page can show; those are GIF and PNG files")
+        raise UsageError(
+            f"{path} is not a picture that a page can show; those are GIF and PNG files"
+        )
     source = f"data:image/{path.suffix[1:]};base64,{base64.b64encode(content).decode()}"
     if len(source) > MOST_BYTES:
         raise UsageError(
@@ -172,18 +174,19 @@ def _facts(results: Results, row: Row) -> list[tuple[str, str]]:
         ("tasks x seeds x episodes",
          f"{summary['num_tasks']} x {summary['num_seeds']} x {summary['num_episodes']}"),
         ("tasks", row.tasks),
-        ("settings that differ", ", ".join(f"{n}={v}" for n, v in row.settings.items()) or "none"),
+        ("settings that differ from the defaults",
+         ", ".join(f"{n}={v}" for n, v in row.settings.items()) or "none"),
         ("initial return", number(summary["initial_return"])),
         ("final return", str(final)),
-        ("IQM [95 %]", str(Interval(summary["final_return_iqm"], low, high))),
+        ("IQM of the final return [95 % interval]", str(Interval(summary["final_return_iqm"], low, high))),
         ("optimal return", number(summary["optimal_return"])),
         ("regret", number(summary["regret"])),
-        ("regret after 40", number(summary["regret_after_40"])),
+        ("regret after 40 episodes", number(summary["regret_after_40"])),
         ("solved optimally", "" if solved is None else f"{100 * solved:.0f} %"),
         ("unsolvable tasks", str(unsolvable) if unsolvable else ""),
         ("parts in order", ", ".join(shares)),
-        ("paper: final", paper),
-        ("far from training", far_prompts(results)),
+        ("paper's final return", paper),
+        ("prompts far from training goals", far_prompts(results)),
         ("weights", (summary.get("policy_sha256") or "")[:12]),
         ("command", " ".join(meta.command)),
         ("revision", meta.revision),

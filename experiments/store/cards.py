@@ -34,8 +34,8 @@ CARD = """# {title} for {env}
 {facts}
 | data | {trajectories:,} demonstrations of {demonstrator}, seed {data_seed}{variants} |{begun}
 | training | {steps:,} steps of {batch_size} trajectories, {optimizer}, {cpu_minutes:.0f} CPU-minutes |
-| validation loss | {val_loss:.4f} nats an action, {correct} {val_accuracy:.4f} |
-| {acting} return of {watched} | {initial:.3f} on {eval_tasks} tasks of the training's own |{followed}
+| validation loss | {val_loss:.4f} nats per action; {correct}: {val_accuracy:.4f} |
+| {acting} return of {watched} | {initial:.3f} on {eval_tasks} validation tasks |{followed}
 
 Made by
 
@@ -148,10 +148,8 @@ def card(run: Finished) -> str:
         else ""
     )
     tested = run.kind.name == MULTI_GOAL
-    tasks = "`tasks.npz` (the\ntest tasks, in no dataset), " if tested else ""
-    goals = (
-        "`goals.npz`\n(a sample of the goals of the training), " if run.policy.seen_goals else ""
-    )
+    tasks = "`tasks.npz` (the\ntest tasks, which no dataset contains), " if tested else ""
+    goals = "`goals.npz`\n(a sample of the training goals), " if run.policy.seen_goals else ""
     return CARD.format(
         title=run.kind.title,
         env=settings.env,
@@ -173,7 +171,9 @@ def card(run: Finished) -> str:
         acting=acting,
         initial=last["eval/initial_return"],
         followed=followed,
-        correct="accuracy" if env.spec.discrete else f"share within {HIT} in all dimensions",
+        correct="accuracy"
+        if env.spec.discrete
+        else f"share of actions within {HIT} in every dimension",
         eval_tasks=settings.eval_tasks,
         command=printable(run.command),
     )
@@ -192,7 +192,7 @@ def _begun(run: Finished) -> str:
     """
     if run.settings.init is None:
         return ""
-    row = f"\n| began from | {_origin(run.settings.init, run.policy.made)} |"
+    row = f"\n| initialized from | {_origin(run.settings.init, run.policy.made)} |"
     folder = run.source / INIT
     if not (folder / CONFIG).is_file():
         return row
@@ -205,8 +205,8 @@ def _begun(run: Finished) -> str:
         f"{before.data.trajectories:,} demonstrations, seed {before.data.data_seed}"
     )
     if before.init is not None:
-        text += f"; began from {_origin(before.init, made)}"
-    return f"{row}\n| which had seen | {text} |"
+        text += f"; initialized from {_origin(before.init, made)}"
+    return f"{row}\n| that policy was trained for | {text} |"
 
 
 def _origin(place: Path, made: Mapping[str, Any]) -> str:

@@ -137,8 +137,8 @@ def check_import(config: ImportConfig) -> None:
     low, high = config.action_low, config.action_high
     if len(low) != len(high):
         raise UsageError(
-            f"--action-low and --action-high must have as many numbers, found {_shown(low) or 'none'} and "
-            f"{_shown(high) or 'none'}"
+            "--action-low and --action-high must have the same number of values, found "
+            f"{_shown(low) or 'none'} and {_shown(high) or 'none'}"
         )
     if any(a >= b for a, b in zip(low, high, strict=True)):
         raise UsageError("--action-low must be below --action-high in every component")

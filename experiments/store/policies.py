@@ -16,7 +16,7 @@ from mgpo_jax.policy_files import CONFIG, hash_in_config, load_policy, read_seen
 from mgpo_jax.released import released_folder
 from mgpo_jax.seen_goals import SeenGoals, warning_of_prompts
 
-GIVE = "give the folder of the one that they were made with by --policy"
+GIVE = "give the folder of the policy that they were made with, using --policy"
 
 
 def load_policy_of(results: Results, world: World, override: Path | None = None) -> LoadedPolicy:

@@ -62,7 +62,7 @@ def told(config: PretrainConfig, facts: Facts) -> str:
     """The dataset of a training and its settings, whether chosen or given, in words."""
     actions = f"{facts.num_actions} actions" if facts.num_actions else f"{facts.action_dim} numbers"
     lines = [
-        f"data: {facts.num_trajectories:,} trajectories of {facts.mean_length:.1f} steps in the mean and "
+        f"data: {facts.num_trajectories:,} trajectories of {facts.mean_length:.1f} steps on average and "
         f"{facts.longest} at most; observations {facts.obs_dtype}{list(facts.obs_shape)}, goals of "
         f"{facts.goal_dim} numbers, {actions}"
     ]
@@ -85,12 +85,11 @@ def schedule(config: PretrainConfig) -> str:
     seen = train.steps * train.batch_size / max(1, config.data.trajectories - config.holdout)
     warmup = min(train.warmup_steps, train.steps - 1)
     falls = (
-        f"falls along a cosine to {0.02 * train.learning_rate:.3g} at the last"
+        f"falls along a cosine to {0.02 * train.learning_rate:.3g} by the last step"
         if train.schedule == "cosine"
-        else "stays there"
+        else "then stays constant"
     )
     return (
-        f"schedule: {train.steps:,} steps of {train.batch_size} trajectories, which sees the data "
-        f"{seen:.1f} "
-        f"times; the learning rate rises to {train.learning_rate:.3g} in {warmup:,} steps and {falls}"
+        f"schedule: {train.steps:,} gradient steps of {train.batch_size} trajectories, which is {seen:.1f} "
+        f"epochs; the learning rate rises to {train.learning_rate:.3g} within {warmup:,} steps and {falls}"
     )

@@ -73,16 +73,17 @@ def check_start(config: PretrainConfig) -> None:
     if has_begun(folder):
         if not config.resume:
             raise UsageError(
-                f"{folder} exists already; continue it with --resume, or choose another with --out"
+                f"{folder} already exists; continue it with --resume, or choose another folder with "
+                "--out"
             )
         check_settings(config)
         if (folder / CHECKPOINTS).exists() and not (folder / CHECKPOINTS).is_dir():
             raise DataError(
-                f"{folder / CHECKPOINTS} is no folder; remove it to train from the first step"
+                f"{folder / CHECKPOINTS} is not a folder; remove it to train from the first step"
             )
     elif os.path.lexists(folder) and not _holds_nothing(folder):
         raise UsageError(
-            f"{folder} exists already and is no training run; choose another with --out"
+            f"{folder} already exists and is not a training run; choose another folder with --out"
         )
     check_place(folder, num_bytes=ROOM)
 
@@ -144,7 +145,7 @@ def keep_initial(config: PretrainConfig, meta: Mapping[str, Any]) -> None:
         return
     place = config.folder / INIT
     if place.exists() and not place.is_dir():
-        raise DataError(f"{place} is no folder; remove it, and --init is read again")
+        raise DataError(f"{place} is not a folder; remove it, and --init is read again")
     place.mkdir(exist_ok=True)
     remove_unfinished(place)
     for name in (WEIGHTS, CONFIG, GOALS):

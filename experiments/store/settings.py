@@ -18,7 +18,7 @@ import tyro
 from pydantic import BaseModel
 
 import envs
-from envs.errors import DataError, UsageError, nearest, shown
+from envs.errors import DataError, UsageError, nearest, printable, shown
 from experiments.joining import OF_PROCESSES, Joined
 from experiments.store.layout import CONFIG
 from mgpo_jax.kinds import KINDS, MULTI_GOAL
@@ -370,8 +370,8 @@ def check_pretraining(config: PretrainConfig) -> None:
         check_initial(config)
     if config.standardize_obs and config.encoder != "linear":
         raise UsageError(
-            f"--standardize-obs has no use with --encoder {config.encoder}, whose codes are no amounts; "
-            "leave it out"
+            f"--standardize-obs does not apply to --encoder {config.encoder}, whose inputs are codes "
+            "rather than quantities; leave it out"
         )
     if config.init is None and config.embed_dim % config.num_heads:
         raise UsageError(
@@ -395,7 +395,9 @@ def _check_own_data(config: PretrainConfig) -> None:
         return
     if data.demonstrator is not None or data.data_seed:
         name = "--data-seed" if data.demonstrator is None else "--demonstrator"
-        raise UsageError(f"--data is collected already: {name} has no use beside it; leave it out")
+        raise UsageError(
+            f"--data is already collected, so {name} does not apply to it; leave {name} out"
+        )
     if config.env == NO_WORLD and config.method != MULTI_GOAL:
         raise UsageError(
             f"--method {config.method} needs a world; name the one that the data is from with --env"
@@ -609,7 +611,7 @@ LIST, ALL = "list", "all"
 
 
 def check_reproduction(config: ReproduceConfig) -> None:
-    """Raise ``UsageError`` for a combination of settings that ``experiments.reproduce`` has no use for."""
+    """Raise ``UsageError`` for settings of ``experiments.reproduce`` that do not apply to what is made."""
     if config.distributed and config.what not in COMPARISONS:
         raise UsageError(
             f"--distributed spreads the cells of a comparison; {config.what} is made by one process, leave "
@@ -621,7 +623,7 @@ def check_reproduction(config: ReproduceConfig) -> None:
         _refuse(config, useless)
         return
     if config.scale != "cpu":
-        raise UsageError(f"{config.what} has no use for --scale {config.scale}; leave it out")
+        raise UsageError(f"--scale {config.scale} does not apply to {config.what}; leave it out")
     if config.what in TRAIN_NOTHING:
         _refuse(config, (*(("only",) if config.what == "table4" else ()), "steps", "trajectories"))
     elif config.num_trajectories <= (kept := pretrain_preset(config.world, "fast").holdout):
@@ -635,6 +637,5 @@ def _refuse(config: ReproduceConfig, names: Iterable[str]) -> None:
     """Raise ``UsageError`` for the first of some useless settings that is given."""
     for name in names:
         if value := getattr(config, name):
-            raise UsageError(
-                f"{config.what} has no use for {flag(name)} {shown(value)}; leave it out"
-            )
+            text = printable(" ".join(value)) if isinstance(value, tuple) else shown(value)
+            raise UsageError(f"{flag(name)} {text} does not apply to {config.what}; leave it out")

@@ -381,7 +381,7 @@ def check_against(
     for name, value in expected.items():
         if not _agree(found[name], value):
             raise DataError(
-                f"{path.with_name(SUMMARY)}: {name} is {_format_value(found[name])}, by {path.name} it is "
+                f"{path.with_name(SUMMARY)}: {name} is {_format_value(found[name])}, but {path.name} gives "
                 f"{_format_value(value)}; {ADAPT_AGAIN}"
             )
 
@@ -466,7 +466,8 @@ def printed(summary: Mapping[str, Any]) -> str:
     if (spl := summary.get("spl")) is not None:
         rows.append(("success rate, SPL", f"{_percent(summary['success_rate'])}, {spl:.3f}"))
     if shares := summary.get("part_shares"):
-        rows.append(("parts in order", "share with the first k done (tasks x seeds that have k)"))
+        shown = "share of searches that did the first k parts (searches with at least k parts)"
+        rows.append(("parts in order", shown))
         rows += [(f"  p{k}", str(PartShare(*pair))) for k, pair in enumerate(shares, 1)]
     rows += _sampling_rows(summary) + _named_goal_rows(summary)
     if unsolvable := summary.get("unsolvable_tasks"):
@@ -488,7 +489,7 @@ def printed(summary: Mapping[str, Any]) -> str:
             ("a search", f"{scored:.0f} prompts scored by the policy, {each:.2f} CPU-seconds")
         )
     if failed:
-        rows.append(("failed episodes", f"{failed} (the world broke down)"))
+        rows.append(("failed episodes", f"{failed} (the simulation failed)"))
     rows.append(
         (
             "speed",

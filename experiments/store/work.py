@@ -113,7 +113,7 @@ def open_journal(
                 f"{pieces} was begun with other settings: {changed}; give the same ones, or remove it"
             )
         say_what_differs(saved.meta, begun.meta, str(pieces))
-        print(f"going on with the unfinished work in {pieces}", file=sys.stderr)
+        print(f"continuing the unfinished work in {pieces}", file=sys.stderr)
         begun = saved.model_copy(update={"resumed": [*saved.resumed, begun.meta]})
     journal = Journal(pieces)
     write_json(pieces / SETTINGS, begun.model_dump())
@@ -123,5 +123,5 @@ def open_journal(
 
 def _farewell(pieces: Path, go_on: str) -> str:
     if has_work(pieces):
-        return f"stopped; what is finished is in {pieces.parent}, {go_on}"
+        return f"stopped; finished work is kept in {pieces.parent}; {go_on}"
     return "stopped before anything was finished; nothing was written"

@@ -316,7 +316,7 @@ def facts(config: CommandConfig) -> dict[str, str]:
     ahead = f"1 to {config.ahead} steps ahead" if config.every_position else "the next one reached"
     return {
         "network": transformer_told(config),
-        "commands": f"{len(config.commands)} goals; in hindsight {ahead}",
+        "commands": f"{len(config.commands)} possible goals; hindsight goals: {ahead}",
     }
 
 

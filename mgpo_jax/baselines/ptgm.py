@@ -254,7 +254,7 @@ def check_ptgm(setting: Setting, hyper: PtgmHyper) -> None:
 
 
 def check_oracle(setting: Setting, hyper: NoHyper) -> None:
-    """Raise ``UsageError`` if the world has no expert that tells goals."""
+    """Raise ``UsageError`` if the world provides no expert goals."""
     del hyper
     env, config = setting.env, setting.network
 

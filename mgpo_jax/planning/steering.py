@@ -52,7 +52,7 @@ def deficit_and_loss(
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """The deficit of a prompt, and the loss whose gradient steers it."""
     if policy.score is None:
-        raise ValueError("this policy tells no likelihoods (its field score is None)")
+        raise ValueError("this policy provides no likelihoods (its field score is None)")
     distribution = policy.score(prompt, lead.obs, lead.actions)
     own = distribution.log_prob(lead.actions)
     preferred = distribution.log_prob(distribution.mode())

@@ -13,7 +13,7 @@ export const hasKnown = (log) => log.hasArms || log.hasMap || log.hasOrder || lo
 
 /** What stands above it. @type {(log: Log) => string} */
 export function knownTitle(log) {
-  const what = log.hasMap ? "its map" : log.hasOrder ? "the order" : log.hasWorths ? "what prompts are worth" : "its arms";
+  const what = log.hasMap ? "its map" : log.hasOrder ? "the order" : log.hasWorths ? "the estimated returns of prompts" : "its arms";
   return `What the optimizer knew: ${what} after this episode`;
 }
 
@@ -79,5 +79,5 @@ function showOrder(parent, { log, seed, number, episode, goalName }) {
 function showWorths(parent, { log, seed, number, episode, goalName }) {
   const rows = log.worths(seed, number, episode).map(({ goals, first, tries, mean, std }, i) =>
     row(first === episode, [String(i + 1), sequence(goals, goalName), String(tries), `${mean.toFixed(2)} ± ${std.toFixed(2)}`]));
-  fill(parent, table(["place", "tried prompt", "episodes", "posterior mean ± deviation"], rows));
+  fill(parent, table(["rank", "prompt", "episodes", "return (posterior mean ± standard deviation)"], rows));
 }

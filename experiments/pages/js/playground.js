@@ -1,4 +1,4 @@
-// The playground: anyone leads a frozen policy by goals, and UCB finds prompts in the page.
+// The playground: anyone guides a frozen policy by clicking goals, and UCB finds prompts in the page.
 
 import { unpack } from "./arrays.js";
 import { curves } from "./chart.js";

@@ -293,10 +293,10 @@ class Report {
   /** What stands below the picture of the episode. */
   stageNote() {
     const { log } = this;
-    if (!this.data.withEpisodes) return "What the episodes did is left out, since the page would be too large.";
-    if (!this.canDraw && !log.hasReached) return "These results do not hold what their episodes did.";
+    if (!this.data.withEpisodes) return "Episode details are left out, because the page would be too large.";
+    if (!this.canDraw && !log.hasReached) return "These results do not include the course of their episodes.";
     if (!this.canDraw || this.isDrawn) return "";
-    if (this.place.episode % log.trackStride === 0) return "Not drawn on the map: played again, this episode does not come to what is on record.";
+    if (this.place.episode % log.trackStride === 0) return "Not drawn on the map: replaying this episode does not reproduce the recorded goals.";
     return `Not drawn on the map, as only the first of every ${log.trackStride} episodes is.`;
   }
 
@@ -378,7 +378,7 @@ class Report {
     ...values.map((value, e) => svg("circle", {
       cx: x(e), cy: y(value), r: e === episode ? 7 : 3.4, fill: isGreedy(e) || e === episode ? log.data.color : "none", stroke: log.data.color, "stroke-width": 1.3,
     })));
-    return element("div", {}, drawing, element("p", { class: "quiet" }, "Full: greedy. Ring: sampled. Large: this episode. Dashed: optimum. Click to choose."));
+    return element("div", {}, drawing, element("p", { class: "quiet" }, "Filled: greedy actions. Open: sampled actions. Large: this episode. Dashed line: optimum. Click to choose an episode."));
   }
 
   showKnown() {
