@@ -153,6 +153,14 @@ def test_noise_of_the_official_program(result: Path) -> None:
     assert sizes == [Noise(obs="official"), Noise(obs=0.5)]
     case = open_case(result, None, sizes)
     assert [env for _, env in case.behind] == [Noisy(ENV, obs_range=WIDTHS), Noisy(ENV, 0.5)]
+    disturbed = open_case(
+        result, None, [Noise(action=0.25), Noise("official", 0.5), Noise(0.1, 0.2)]
+    )
+    assert [env for _, env in disturbed.behind] == [
+        Noisy(ENV, action_noise=0.25),
+        Noisy(ENV, action_noise=0.5, obs_range=WIDTHS),
+        Noisy(ENV, 0.1, 0.2),
+    ]
     rows = list(evaluate_cases([case], episodes=2, seed=0))
     assert [row["obs_noise"] for row in rows] == ["official", 0.5]
     assert [cells(row)[5] for row in rows] == ["observations official", "observations 0.5"]

@@ -11,6 +11,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -53,7 +54,7 @@ class TestMissingPackage:
 
 pytest.importorskip("craftax")
 from envs.crafter import rules  # noqa: E402
-from envs.crafter.env import Crafter, CrafterTask  # noqa: E402
+from envs.crafter.env import Crafter, CrafterState, CrafterTask  # noqa: E402
 from envs.crafter.pictures import crafter_pictures, unlocks_of, way_of  # noqa: E402
 from envs.crafter.tiles import agent_picture, picture, tiles  # noqa: E402
 from envs.crafter.view import (  # noqa: E402
@@ -355,3 +356,15 @@ def test_nothing_is_written_beside_the_package():
     )
     root = str(Path(__file__).parents[1])
     subprocess.run([sys.executable, "-c", code], check=True, cwd=root, env={**os.environ})
+
+
+def test_the_expert_goes_for_what_usually_comes_first_of_the_rest():
+    nothing = CrafterState(*[None] * len(CrafterState._fields))
+    unlocked = np.zeros(len(ACHIEVEMENTS), bool)
+    for name in ("collect_wood", "collect_sapling", "place_table"):
+        state = nothing._replace(world=SimpleNamespace(achievements=jnp.asarray(unlocked)))
+        goal = ENV.expert_goal(state, 10)
+        wanted = np.arange(len(ACHIEVEMENTS)) == ACHIEVEMENTS.index(name)
+        np.testing.assert_array_equal(goal[: len(wanted)], wanted)
+        assert not goal[len(wanted) :].any()
+        unlocked |= wanted

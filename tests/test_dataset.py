@@ -181,6 +181,15 @@ def test_the_stream_can_start_anywhere(first, truncate, seed):
             assert part.num_steps == other_part.num_steps
 
 
+def test_every_batch_is_a_mix_of_all_lengths():
+    """Parts hold similar lengths, and are not used in the order of these."""
+    dataset = make_dataset([1, 2, 3, 4, 5, 6, 7, 8])
+    stream = plans(dataset, truncate=False, batch_size=80, part_size=10, pool_steps=8)
+    means = [np.mean([part.lengths.mean() for part in batch]) for batch in islice(stream, 8)]
+    assert np.ptp(means) < 5  # in order, those of the first and the last batch would be 1 and 8
+    assert (np.diff(means) < 0).any()
+
+
 @pytest.mark.parametrize("truncate", [True, False])
 def test_batches_have_their_size_and_fit_their_padding(dataset, truncate):
     for batch in islice(plans(dataset, truncate=truncate), 20):

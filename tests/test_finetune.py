@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from envs.base import ArraySpec, Discrete, Environment, EnvSpec, Episode, TimeStep
@@ -16,7 +17,17 @@ from envs.errors import NotAvailableError, UsageError
 from envs.registry import Judgement
 from mgpo_jax import methods
 from mgpo_jax.adaptation import Adapter, search
-from mgpo_jax.baselines.finetune import make_ppo, make_reinforce
+from mgpo_jax.baselines import finetune
+from mgpo_jax.baselines.finetune import (
+    Batch,
+    Finetuner,
+    Pass,
+    Round,
+    ValueHead,
+    Weights,
+    make_ppo,
+    make_reinforce,
+)
 from mgpo_jax.baselines.methods import (
     CarefulPpoHyper,
     CarefulReinforceHyper,
@@ -294,6 +305,115 @@ def test_a_chain_is_learned(params: Any, make: Any, hyper: Any) -> None:
     runs = jax.jit(jax.vmap(lambda key: search(key, ENV, adapter, TASK, 200).log.returns))
     returns = runs(jax.random.split(jax.random.key(7), 4)).reshape(4, -1)
     assert returns[:, -20:].mean() > 0.95 > returns[:, :20].mean() + 0.2
+
+
+def tuner_of(make: Any, hyper: Any, params: Any) -> Finetuner:
+    """The fine-tuning behind an adapter."""
+    made = []
+
+    class Noted(Finetuner):
+        def __init__(self, *args: Any) -> None:
+            super().__init__(*args)
+            made.append(self)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(finetune, "Finetuner", Noted)
+        make(SETTING, params, hyper)
+    return made[0]
+
+
+@pytest.fixture(scope="module")
+def batch(params: Any, round_of_episodes: Any) -> Batch:
+    """Five episodes of different lengths, with values that are not 0."""
+    _, state, query, episodes = round_of_episodes
+    tuner = Finetuner(SETTING, params, PpoHyper(), Round(lambda batch: lambda now, batch: 0.0))
+    batch = jax.jit(tuner._batch)(state, query, episodes)
+    values = jax.random.normal(jax.random.key(8), batch.rewards.shape)
+    rewards = batch.rewards + jnp.where(batch.real, 0.1 * values, 0.0)
+    return batch._replace(rewards=rewards, values=values)
+
+
+def shifted(batch: Batch, by: float) -> Pass:
+    """The network's outputs after the logits of action 1 have grown, and with values of 0."""
+    logits = batch.before.logits.at[..., 1].add(by)
+    return Pass(type(batch.before)(logits), jnp.zeros_like(batch.values))
+
+
+@pytest.mark.parametrize("baseline", [False, True])
+def test_the_loss_of_reinforce_by_hand(params: Any, batch: Batch, baseline: bool) -> None:
+    tuner = tuner_of(make_reinforce, ReinforceHyper(baseline=baseline, discount=0.5), params)
+    now = shifted(batch, 0.3)
+    found = tuner.how.loss(batch)(now, batch)
+    rewards, real = np.asarray(batch.rewards), np.asarray(batch.real)
+    steps = range(ENV.horizon)
+    togo = np.array(
+        [[sum(0.5 ** (u - t) * row[u] for u in steps[t:]) for t in steps] for row in rewards]
+    )
+    if baseline:
+        togo = togo - togo.mean(axis=0)
+    log_probs = np.asarray(now.actions.log_prob(batch.actions))
+    np.testing.assert_allclose(found, -(togo * log_probs)[real].mean(), rtol=1e-4)
+
+
+def test_the_loss_of_ppo_by_hand(params: Any, batch: Batch) -> None:
+    """The policy has moved so far that some ratios are clipped on either side."""
+    hyper = PpoHyper(clip=0.2, value_weight=0.25, discount=0.9, gae_lambda=0.8)
+    tuner, now = tuner_of(make_ppo, hyper, params), shifted(batch, 1.0)
+    found = tuner.how.loss(batch)(now, batch)
+    real = np.asarray(batch.real)
+    estimate = jax.vmap(advantages, (0, 0, 0, None, None))
+    gains = np.asarray(estimate(batch.rewards, batch.values, batch.real, 0.9, 0.8))
+    targets = (gains + np.asarray(batch.values))[real]
+    gains = ((gains - gains[real].mean()) / gains[real].std())[real]
+    log_ratio = now.actions.log_prob(batch.actions) - batch.before.log_prob(batch.actions)
+    ratio = np.exp(np.asarray(log_ratio))[real]
+    assert ratio.min() < 0.8
+    assert ratio.max() > 1.2
+    gained = np.minimum(ratio * gains, np.clip(ratio, 0.8, 1.2) * gains)
+    np.testing.assert_allclose(found, -gained.mean() + 0.25 * (targets**2).mean(), rtol=1e-4)
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_values_train_the_network_only_where_it_is_shared(
+    params: Any, batch: Batch, shared: bool
+) -> None:
+    tuner = tuner_of(make_ppo, PpoHyper(share_trunk=shared), params)
+    weights = tuner.init(jax.random.key(1), GOAL).weights
+    head = jax.tree.map(lambda leaf: leaf + 1.0, weights.value)
+
+    @jax.jit
+    def gradient(policy: Any) -> Any:
+        values = lambda policy: tuner._forward(Weights(policy, head), batch).values.sum()  # noqa: E731
+        return jax.grad(values)(policy)
+
+    grads = gradient(weights.policy)
+    assert any(np.any(np.asarray(grad)) for grad in jax.tree.leaves(grads)) == shared
+
+
+def test_gradients_of_policy_and_values_are_clipped_apart() -> None:
+    """AdamW's first moment is a tenth of the gradient that it is given."""
+    optimize = finetune.optimizer(PpoHyper(clip_norm=0.5), 0.01)
+    weights = Weights({"kernel": jnp.zeros(4)}, ValueHead(jnp.zeros(4), jnp.zeros(())))
+    grads = Weights({"kernel": jnp.full(4, 5.0)}, ValueHead(jnp.full(4, 0.1), jnp.zeros(())))
+    _, state = optimize.update(grads, optimize.init(weights), weights)
+    for kind, norm in (("policy", 0.5), ("value", 0.2)):
+        moments = optax.tree.get(state.inner_states[kind], "mu")
+        np.testing.assert_allclose(optax.tree.norm(moments), 0.1 * norm, rtol=1e-5)
+
+
+def test_the_penalty_is_for_leaving_the_pre_trained_policy(
+    params: Any, round_of_episodes: Any
+) -> None:
+    """Also after rounds that have moved the policy."""
+    _, state, query, episodes = round_of_episodes
+    tuner = tuner_of(make_ppo, PpoHyper(), params)
+    policy = jax.tree.map(lambda leaf: leaf + 0.1, state.weights.policy)
+    moved = state._replace(weights=state.weights._replace(policy=policy))
+    batch_of = jax.jit(lambda state: tuner._batch(state, query, episodes))
+    first, later = batch_of(state), batch_of(moved)
+    assert_close(first.pretrained, first.before, 1e-6)
+    assert_close(later.pretrained, first.before, 1e-6)
+    assert np.abs(later.before.logits - first.before.logits).max() > 1e-2
 
 
 def test_a_strong_penalty_keeps_the_policy(params: Any, round_of_episodes: Any) -> None:

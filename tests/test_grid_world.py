@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 import envs
 from envs.base import TimeStep
-from envs.gridworld.env import EAST, FLIP, NORTH, SOUTH, STAY, WEST, GridTask, GridWorld
+from envs.gridworld.env import EAST, FLIP, NORTH, SOUTH, STAY, WEST, GridState, GridTask, GridWorld
 
 WORLD = envs.make("gridworld")
 HORIZON = 90
@@ -619,3 +619,12 @@ def test_the_fewest_steps_are_enough_from_the_first_object(horizon, solved):
 
 def test_every_order_of_the_world_can_be_solved(all_tasks):
     assert np.asarray(jax.jit(jax.vmap(WORLD.solvable))(GridTask(jnp.asarray(all_tasks)))).all()
+
+
+def test_the_expert_goes_for_the_next_object():
+    """After the last object of the order it stays with that one."""
+    nothing = GridState(*[None] * len(GridState._fields))
+    state = nothing._replace(task=GridTask(jnp.asarray(padded((5, 2, 6)))))
+    for solved, thing in ((0, 5), (1, 2), (2, 6), (3, 6)):
+        goal = WORLD.expert_goal(state._replace(num_solved=jnp.int32(solved)), 10)
+        np.testing.assert_array_equal(goal, np.eye(7)[thing])

@@ -10,6 +10,7 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -562,3 +563,49 @@ def test_the_weights_that_are_given_are_copied(toy: Any) -> None:
         jax.tree.leaves(state.params), jax.tree.leaves(policy.params), strict=True
     ):
         assert ours.unsafe_buffer_pointer() != theirs.unsafe_buffer_pointer()
+
+
+@pytest.mark.parametrize("cut", [True, False])
+def test_a_library_call_cuts_trajectories_where_the_world_allows_it(
+    toy: Any, monkeypatch: pytest.MonkeyPatch, cut: bool
+) -> None:
+    class AskedError(Exception):
+        pass
+
+    def planning(config: TrainConfig, dataset: Dataset, truncate: bool, *more: Any) -> None:
+        raise AskedError(truncate)
+
+    monkeypatch.setattr("mgpo_jax.training.batch_stream", planning)
+    dataset, policy = toy
+    with pytest.raises(AskedError) as asked:
+        pretrain(dataset, replace(SPEC, truncate_in_hindsight=cut), TRAIN, policy)
+    assert asked.value.args == (cut,)
+
+
+@pytest.mark.parametrize("env", ["maze15", "gridworld"])
+def test_a_run_trains_on_what_is_not_held_out_and_cuts_it_where_the_world_allows_it(
+    env: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every trajectory has a length of its own, the last two are held out."""
+    spec, num = training.envs.make(env).spec, 12
+    lengths = np.arange(21, 21 + num, dtype=np.int32)
+    goals = np.zeros((lengths.sum(), spec.goal_dim), np.float32)
+    whole = Dataset(
+        obs=np.zeros((len(goals), *spec.obs.shape), spec.obs.dtype),
+        actions=np.zeros(len(goals), np.int32),
+        achieved_goals=goals,
+        goal_reached=np.ones(len(goals), bool),
+        outcomes=goals,
+        lengths=lengths,
+    )
+    monkeypatch.setattr(training, "prepare_dataset", lambda *args: (whole, tmp_path, "0" * 64))
+    monkeypatch.setattr(training, "watched", lambda *args: lambda params: {})
+    config = parsed(f"{BASE} --env {env} --embed-dim 8 --num-layers 1")
+    run = training.Run(replace(config, holdout=2, out=tmp_path), "")
+    np.testing.assert_array_equal(run.fit.lengths, lengths[:-2])
+    np.testing.assert_array_equal(run._held_out.lengths, lengths[-2:])
+    parts = [part for batch in islice(run.batches(0), 8) for part in batch]
+    assert max(part.indices.max() for part in parts) == num - 3
+    cut = np.concatenate([lengths[part.indices] - part.lengths for part in parts])
+    assert cut.min() >= 0
+    assert (cut > 0).any() == spec.truncate_in_hindsight == (env == "maze15")

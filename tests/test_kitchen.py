@@ -22,7 +22,7 @@ import envs
 from envs.errors import MissingExtraError
 from envs.kitchen import NoOpenGLError, extra
 from envs.kitchen.demonstrators import kitchen_demonstrators
-from envs.kitchen.env import NONE, SUBTASKS, Kitchen, KitchenTask
+from envs.kitchen.env import NONE, SUBTASKS, Kitchen, KitchenState, KitchenTask
 from envs.kitchen.fidelity import jit_for
 from mgpo_jax.sharding import device_mesh
 
@@ -219,6 +219,15 @@ class TestTasks:
     def test_bad_tasks(self, order, message):
         with pytest.raises(ValueError, match=message):
             WORLD.check_task(KitchenTask(np.array(order)))
+
+
+def test_the_expert_goes_for_the_next_subtask():
+    """After the last subtask of the task it stays with that one."""
+    nothing = KitchenState(*[None] * len(KitchenState._fields))
+    state = nothing._replace(task=KitchenTask(jnp.asarray(padded([LIGHT, HINGE]))))
+    for solved, subtask in ((0, LIGHT), (1, HINGE), (2, HINGE)):
+        goal = WORLD.expert_goal(state._replace(num_solved=jnp.int32(solved)), 10)
+        np.testing.assert_array_equal(goal, multi_hot([subtask]))
 
 
 class TestBadInput:

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from functools import cache
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from conftest import require_kitchen
 
-from envs.kitchen.env import NONE, SUBTASKS, Kitchen, KitchenTask
+from envs.base import TimeStep
+from envs.kitchen.env import NONE, SUBTASKS, Kitchen, KitchenState, KitchenTask
 
 require_kitchen()
 import mujoco  # noqa: E402
 
 import envs  # noqa: E402
+from envs.kitchen import demonstrators  # noqa: E402
 from envs.kitchen.arm import PAD, arm_pose, make_arm, rotation_vector, turn  # noqa: E402
 from envs.kitchen.demonstrators import HIGH, LOW, scripted_arm  # noqa: E402
 from envs.kitchen.model import load_model  # noqa: E402
@@ -119,3 +122,22 @@ class TestExpert:
     def test_by_name(self):
         known = envs.find("kitchen").demonstrators(WORLD)
         assert list(known) == ["expert", "expert-reduced", "expert-stock", "expert-mjx"]
+
+    def test_actions_have_the_noise_of_the_manifest(self, monkeypatch):
+        """Whatever the demonstrator does, nine components have independent noise of the size named."""
+        meant = jnp.linspace(-0.5, 0.5, 9)
+        for name in ("look", "is_over", "current_phase", "next_subtask"):
+            monkeypatch.setattr(demonstrators, name, lambda *args: None)
+        monkeypatch.setattr(demonstrators, "advance", lambda plan, memory, *args: memory)
+        monkeypatch.setattr(demonstrators, "act", lambda *args: meant)
+        nothing = KitchenState(*[None] * len(KitchenState._fields))
+        state = nothing._replace(physics=SimpleNamespace(qpos=jnp.zeros(14)))
+        memory, timestep = demonstrators.Memory(*[jnp.int32(0)] * 4), TimeStep(*[None] * 7)
+        agent = scripted_arm(WORLD)
+        act = jax.jit(jax.vmap(lambda key: agent.proceed(key, memory, state, timestep)[0]))
+        noise = np.asarray(act(jax.random.split(jax.random.key(0), 2_000)) - meant)
+        np.testing.assert_allclose(noise.std(axis=0), 0.08, rtol=0.1)
+        np.testing.assert_allclose(noise.mean(axis=0), 0, atol=0.01)
+        assert np.abs(np.corrcoef(noise.T) - np.eye(9)).max() < 0.1
+        for demonstrator in envs.find("kitchen").demonstrators(WORLD).values():
+            assert dict(demonstrator.settings)["noise"] == 0.08

@@ -512,3 +512,9 @@ class TestGenerateMaze:
             [mean_path(maze) for maze in batch[:400]] for batch in (ours, classic)
         )
         assert agree(np.array(paths), np.array(classic_paths))
+
+
+def test_goals_to_choose_from_are_all_cells_within_the_border():
+    inner = [(row, column) for row in range(1, 6) for column in range(1, 6)]
+    wanted = [TINY.goal_at(jnp.array(cell)) for cell in inner]
+    np.testing.assert_allclose(TINY.goal_set, wanted, rtol=1e-6)

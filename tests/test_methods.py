@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 
 from envs.errors import NotAvailableError, UsageError
+from envs.gridworld.env import GridWorld
 from envs.maze.env import MazeRunner
 from envs.registry import Judgement, World
-from envs.wrappers import Wrapper
+from envs.wrappers import Noisy, Wrapper
 from mgpo_jax import methods, runner
 from mgpo_jax.adaptation import Adapter
 from mgpo_jax.methods import (
@@ -30,10 +31,16 @@ from mgpo_jax.methods import (
     GripsHyper,
     Method,
     NoHyper,
+    PlanHyper,
     Setting,
     UcbHyper,
     split_hyper,
 )
+from mgpo_jax.optimizers import methods as factories
+from mgpo_jax.optimizers.base import SearchSpace
+from mgpo_jax.optimizers.methods import search_space
+from mgpo_jax.planning import methods as planning
+from mgpo_jax.planning.searching import Features
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.prompts import Prompt
 from mgpo_jax.runner import adapt, sweep
@@ -193,27 +200,53 @@ def test_worlds_have_defaults_of_their_own(policy):
         BBT.hyper_in(wrong)
 
 
-def test_an_adaptation_starts_from_the_defaults_of_its_world(policy, monkeypatch):
-    class AskedError(Exception):
-        """Tells with which hyper-parameters an adaptation would run."""
+class AskedError(Exception):
+    """Tells what an adaptation would run with."""
 
-    def ask(env, policy, tasks, method, hypers, **options):
-        raise AskedError(hypers)
 
-    monkeypatch.setattr(runner, "sweep", ask)
-    world, tasks = (
-        replace(WORLD, method_defaults={"ucb": {"scale": 3.0}}),
-        sample_tasks(ENV, 0, 1),
-    )
+@pytest.fixture
+def asked(policy, monkeypatch):
+    """``(world, method, hyper, ..) -> (hyper-parameters, options)`` of the search that would be run."""
+
+    def searching(env, policy, tasks, method, hypers, **options):
+        raise AskedError(hypers, options)
+
+    monkeypatch.setattr(runner, "sweep", searching)
+
+    def ask(*args, **options):
+        world, *rest = args
+        with pytest.raises(AskedError) as found:
+            adapt(world, policy, sample_tasks(ENV, 0, 1), *rest, **options)
+        return found.value.args
+
+    return ask
+
+
+def test_an_adaptation_starts_from_the_defaults_of_its_world(asked):
+    world = replace(WORLD, method_defaults={"ucb": {"scale": 3.0}})
     for where, hyper, wanted in (
         (world, None, UcbHyper(scale=3.0)),
         (world, {"c": 2.0}, UcbHyper(scale=3.0, c=2.0)),
         (world, UcbHyper(), UcbHyper()),
         (ENV, None, UcbHyper()),
     ):
-        with pytest.raises(AskedError) as asked:
-            adapt(where, policy, tasks, "ucb", hyper)
-        assert asked.value.args == ([wanted],)
+        hypers, _ = asked(where, "ucb", hyper)
+        assert hypers == [wanted]
+
+
+def test_an_adaptation_is_judged_as_its_world_is(asked):
+    sampled = Judgement("sample", 0.5, episodes=3)
+    world = replace(WORLD, judged=sampled)
+    assert asked(world, "ucb")[1]["judged"] == sampled
+    assert asked(world, "ucb", judged=Judgement())[1]["judged"] == Judgement()
+    assert asked(ENV, "ucb")[1]["judged"] is None  # there is no record to ask
+    assert asked(ENV, "ucb", judged=sampled)[1]["judged"] == sampled
+
+
+def test_a_library_call_passes_its_numbers_on(asked):
+    numbers = {"seeds": 2, "episodes": 7, "seed": 3, "eval_every": 5, "keep_actions": True}
+    found = asked(WORLD, "ucb", **numbers)[1]
+    assert {name: found[name] for name in numbers} == numbers
 
 
 def test_hyper_parameters_from_a_dict():
@@ -351,3 +384,72 @@ assert not heavy, heavy
 def test_records_need_no_jax():
     """Names, help and usage errors answer at once."""
     subprocess.run([sys.executable, "-c", WITHOUT_JAX], check=True, cwd=ROOT)
+
+
+GRID = GridWorld(name="grid", horizon=20)
+
+
+@pytest.mark.parametrize("keeps", [True, False])
+@pytest.mark.parametrize("env", [ENV, GRID])
+def test_the_search_space_is_that_of_the_world(env, keeps):
+    """The maze is deterministic; the starts of GridWorld are random, and its rewards confirm goals."""
+    setting, hyper = replace(SETTING, env=env), UcbHyper(max_goals=2, keep_rewarded=keeps)
+    assert env.spec.deterministic == (env is ENV)
+    assert search_space(setting, hyper) == SearchSpace(
+        num_slots=3,
+        horizon=env.spec.horizon,
+        return_range=env.spec.return_range,
+        num_episodes=9,
+        sample_goal=env.sample_goal,
+        max_goals=2,
+        deterministic=env is ENV,
+        keep_rewarded=keeps and env is GRID,
+    )
+    assert not search_space(setting, GripsHyper()).keep_rewarded
+    disturbed = replace(setting, env=Noisy(env, action_noise=0.1))
+    assert not search_space(disturbed, hyper).deterministic
+
+
+@pytest.mark.parametrize(
+    ("name", "numbers"),
+    [
+        ("ucb", {"c": 2.0, "scale": 0.5}),
+        ("ucb", {"c": 1.0, "scale": None}),
+        ("bpe", {"min_std": 0.3}),
+        ("explore", {}),
+        ("grips", {"num_edits": 3}),
+        ("bbt", {"population_size": 4, "latent_dim": 2, "std_init": 0.25}),
+    ],
+)
+def test_an_optimizer_gets_the_space_and_all_numbers_of_its_method(
+    name, numbers, policy, monkeypatch
+):
+    method, given = methods.find(name), []
+    hyper = method.hyper(**numbers, max_goals=2)
+
+    def noted(*space, **others):
+        given.append((space, others))
+        return real(*space, **others)
+
+    real = getattr(factories, name)
+    monkeypatch.setattr(factories, name, noted)
+    method.adapter(SETTING, policy.params, hyper)
+    assert given == [((search_space(SETTING, hyper),), numbers)]
+
+
+@pytest.mark.parametrize("splice", [True, False])
+def test_a_plan_has_the_features_that_its_settings_name(policy, monkeypatch, splice):
+    given = []
+
+    def noted(*args):
+        given.append(args)
+        return factories.fixed_prompt(3)
+
+    monkeypatch.setattr(planning, "plan_map", noted)
+    hyper = PlanHyper(
+        rehearse=1, steer=2, splice=splice, frontier=not splice, num_states=7, max_goals=2
+    )
+    methods.PLAN.adapter(SETTING, policy.params, hyper)
+    ((space, spec, _, num_states, features),) = given
+    assert (space, spec, num_states) == (search_space(SETTING, hyper), ENV.spec, 7)
+    assert features == Features(rounds=1, steering=2, splice=splice, frontier=not splice)

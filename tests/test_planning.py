@@ -17,8 +17,9 @@ from mgpo_jax.adaptation import search
 from mgpo_jax.distributions import Categorical
 from mgpo_jax.optimizers.base import SearchSpace
 from mgpo_jax.optimizers.methods import prompt_adapter
+from mgpo_jax.planning import worths
 from mgpo_jax.planning.maps import plan_map
-from mgpo_jax.planning.orders import NONE, moved_goals, plan_order, without
+from mgpo_jax.planning.orders import MOVED, NONE, moved_goals, plan_order, without
 from mgpo_jax.planning.proposals import changed, random_prompts
 from mgpo_jax.planning.rehearsal import ARRIVES, FAILS, Ahead, Seen, rehearse
 from mgpo_jax.planning.searching import Features
@@ -34,9 +35,16 @@ from mgpo_jax.planning.table import (
     steps_from,
     steps_to,
 )
-from mgpo_jax.planning.worths import SHARE_OF_PROMPT, alike, likeness, plan_worth, posterior
+from mgpo_jax.planning.worths import (
+    SHARE_OF_PROMPT,
+    Posterior,
+    alike,
+    likeness,
+    plan_worth,
+    posterior,
+)
 from mgpo_jax.policy import Policy
-from mgpo_jax.prompts import goals_of, prompt_of, single_goal
+from mgpo_jax.prompts import Prompt, goals_of, prompt_of, single_goal
 from mgpo_jax.rollout import Query, rollout
 
 SIDE, NUM_SLOTS = 9, 5
@@ -325,13 +333,16 @@ ABLATIONS = (Features(steering=0), Features(splice=False), Features(frontier=Fal
 )
 def test_ablations_run_and_are_no_better(tasks, finals, features):
     optimum = np.asarray(jax.vmap(WORLD.optimal_return)(tasks))
-    _, returns = adapted(tasks, features)
+    result, returns = adapted(tasks, features)
+    prompts, others = (each.log.choices.prompt.goals for each in (result, finals[0]))
+    assert (prompts != others).any()
     assert np.mean(optimum - returns) >= np.mean(optimum - finals[1]) - 0.02
 
 
 def test_a_map_without_room_still_adapts(tasks):
-    _, returns = adapted(tasks, num_states=3, num_episodes=6)
-    assert np.isfinite(returns).all()
+    result, returns = adapted(tasks, num_states=3, num_episodes=6)
+    gained = returns - np.asarray(result.log.returns)[:, 0, 0]
+    assert gained.min() > -1e-5  # the first episode evaluates (g^M)
 
 
 def test_beyond_a_full_map_prompts_are_those_of_the_best_episode(tasks, finals):
@@ -345,8 +356,12 @@ def test_beyond_a_full_map_prompts_are_those_of_the_best_episode(tasks, finals):
 
 
 def test_prompts_of_one_goal_still_adapt(tasks):
-    _, returns = adapted(tasks, policy=compass(num_slots=1), num_episodes=4)
-    assert np.isfinite(returns).all()
+    result, returns = adapted(tasks, policy=compass(num_slots=1), num_episodes=4)
+    prompts = np.asarray(result.log.choices.prompt.goals)
+    np.testing.assert_array_equal(
+        prompts, np.broadcast_to(jax.vmap(WORLD.task_goal)(tasks)[:, None, None], prompts.shape)
+    )
+    np.testing.assert_allclose(returns, result.log.returns[:, 0, 0], atol=1e-5)
 
 
 NUM_GOALS = 5
@@ -460,7 +475,13 @@ def test_moved_goals_keep_the_task_goal():
     assert moved.mask.tolist() == prompt.mask.tolist()
     assert float(moved.goals[-1, 0]) == 9.0
     assert (moved.goals[:2] == 0).all()
-    assert 0 < float(jnp.abs(moved.goals - prompt.goals).max()) < 2
+    many = jax.vmap(lambda key: moved_goals(key, prompt).goals)(
+        jax.random.split(jax.random.key(1), 2_000)
+    )
+    noise = np.asarray(many - prompt.goals)[:, 2:4, 0] / MOVED
+    np.testing.assert_allclose(noise.std(axis=0), np.mean([1, 4, 9]) ** 0.5, rtol=0.1)
+    sizes = np.abs(noise).max(axis=1)  # of three kinds of prompts, one is moved three times as far
+    assert (sizes > 4).mean() > 0.05
 
 
 def test_likeness_counts_goals_and_orders():
@@ -515,3 +536,46 @@ def test_a_posterior_is_that_of_a_gaussian_process():
     np.testing.assert_allclose(found.std[:5] ** 2, variance, rtol=1e-3)
     best = optimizer.best(state)
     np.testing.assert_array_equal(best.goals, prompts[int(np.argmax(wanted))].goals)
+
+
+@pytest.fixture
+def candidates(monkeypatch):
+    """16 candidates, and a function that sets the mean and deviation of the worth of some of them."""
+    goals = jnp.arange(16.0 * 4 * 2).reshape(16, 4, 2)
+    drawn = Prompt(goals, jnp.ones((16, 4), bool))
+    monkeypatch.setattr(worths, "random_prompts", lambda *args: drawn)
+
+    def believe(mean, std):
+        rows = [jnp.zeros(16).at[jnp.array(list(of))].set(list(of.values())) for of in (mean, std)]
+        monkeypatch.setattr(worths, "posterior", lambda state, kernel: Posterior(*rows))
+
+    return drawn, believe
+
+
+def test_the_candidate_with_the_largest_draw_is_run(candidates):
+    """One of known worth, and as often one that may be worth more or less."""
+    drawn, believe = candidates
+    space = SearchSpace(
+        num_slots=4,
+        horizon=5,
+        return_range=(0.0, 1.0),
+        num_episodes=8,
+        sample_goal=lambda key: jnp.zeros(2),
+        deterministic=False,
+    )
+    optimizer = plan_worth(space)
+    state = optimizer.init(jax.random.key(0), jnp.ones(2))._replace(size=jnp.int32(1))
+    keys = jax.random.split(jax.random.key(1), 64)
+
+    def run():
+        query = jax.jit(jax.vmap(lambda key: optimizer.ask(key, state)[0]))(keys)
+        assert not query.greedy.any()
+        same = (query.prompt.goals[:, None] == drawn.goals).all(axis=(2, 3))
+        assert (same.sum(axis=1) == 1).all()
+        return np.bincount(np.argmax(same, axis=1), minlength=16)
+
+    believe({5: 1.0}, {5: 0.0})
+    assert run()[5] == 64
+    believe({5: 1.0}, {2: 100.0})
+    assert run()[[2, 5]].sum() == 64
+    assert 16 < run()[2] < 48

@@ -74,6 +74,7 @@ def test_prompts_that_are_too_short_do_not_count(
     )
 
     def uncertainty(env, policy, tasks, query, *, seed):
+        assert not np.asarray(query.greedy).any()  # in the paper, episodes are sampled
         num = query.prompt.mask.sum(axis=-1)
         return Uncertainty(1.0 / num, -num * 1.0, num)
 

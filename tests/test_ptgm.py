@@ -17,12 +17,14 @@ from envs.errors import NotAvailableError, UsageError
 from envs.registry import Judgement
 from mgpo_jax import methods
 from mgpo_jax.adaptation import search
-from mgpo_jax.baselines import commanded
+from mgpo_jax.baselines import commanded, ptgm
 from mgpo_jax.baselines.commanded import (
     CommandConfig,
     CommandedTransformer,
+    View,
     commanded_loss,
     complete,
+    log_prior,
     nearest_command,
     relabeled,
 )
@@ -36,7 +38,7 @@ from mgpo_jax.baselines.hierarchy import (
     transitions,
 )
 from mgpo_jax.baselines.methods import PtgmGoalHyper, PtgmHyper
-from mgpo_jax.baselines.ptgm import Kept, Ptgm, greedy_divergence, targets
+from mgpo_jax.baselines.ptgm import Choice, Kept, Ptgm, greedy_divergence, targets
 from mgpo_jax.methods import Setting
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.transformer import grow_cache, world_side
@@ -211,15 +213,15 @@ def test_decisions_fall_on_every_third_step():
 
 def episode_of(rewards: list[float], length: int, kept: Any) -> Episode:
     trajectory: Any = Trajectory(None, None, None, None, None, jnp.int32(length))
-    return Episode(
-        trajectory, jnp.asarray(rewards), jnp.sum(jnp.asarray(rewards)), None, False, kept
-    )
+    paid = jnp.asarray(rewards)
+    return Episode(trajectory, paid, jnp.sum(paid), None, decisions=kept)
 
 
 def test_transitions_by_hand():
     """Seven steps of at most eight, a decision every third."""
     episode = episode_of([1, 2, 3, 4, 5, 6, 7, 0], 7, jnp.array([5, 6, 7]))
     found = transitions(episode, 3)
+    np.testing.assert_array_equal(found.kept, [5, 6, 7])
     np.testing.assert_array_equal(found.reward, [6, 15, 7])
     np.testing.assert_array_equal(found.valid, [True, True, True])
     np.testing.assert_array_equal(found.done, [False, False, True])
@@ -331,13 +333,75 @@ def test_the_target_is_replaced_every_tenth_update(params):
     assert not all(jax.tree.leaves(jax.tree.map(np.array_equal, later.params, later.target)))
 
 
-def test_without_exploring_and_kl_the_first_choices_are_those_of_the_first_network(params):
-    ptgm = learner(PtgmHyper(epsilon=0.0, learning_rate=0.0), params)
-    result = jax.jit(
-        lambda key: search(key, ENV, ptgm.adapter(), ENV.sample_task(jax.random.key(0)), 4)
-    )(jax.random.key(3))
-    assert np.isfinite(np.asarray(result.log.returns)).all()
-    assert float(result.best.epsilon) == 0.0
+@pytest.fixture(scope="module")
+def view() -> View:
+    return View(*jax.random.normal(jax.random.key(5), (2, CONFIG.embed_dim)))
+
+
+def rule_of(module: Any, agent: Any, state: Any, choice: Any) -> Any:
+    """``(key, view, state of the world) -> decision, what is kept``: the high level of ``agent`` alone."""
+    rules = []
+
+    def noted(low: Any, decide: Any, *sizes: Any) -> Any:
+        rules.append(decide)
+        return hierarchical(low, decide, *sizes)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "hierarchical", noted)
+        agent.agent(state, choice)
+    return rules[0]
+
+
+@pytest.mark.parametrize("epsilon", [0.0, 0.25, 1.0])
+def test_goals_are_those_of_the_largest_value_but_for_exploration(params, view, epsilon):
+    agent = learner(PtgmHyper(), params)
+    state = agent.init(jax.random.key(0), jnp.zeros(CONFIG.goal_dim))
+    decide = rule_of(ptgm, agent, state, Choice(jnp.float32(epsilon)))
+    keys, num = jax.random.split(jax.random.key(2), 2_000), CONFIG.goal_dim
+    goals, kept = jax.jit(jax.vmap(lambda key: decide(key, view, None)))(keys)
+    best = jnp.argmax(agent.q.apply(state.params, view.obs))
+    shares = np.bincount(goals, minlength=num) / len(keys)
+    wanted = epsilon / num + (1 - epsilon) * (np.arange(num) == best)
+    np.testing.assert_allclose(shares, wanted, atol=0.05 if epsilon else 0)
+    np.testing.assert_array_equal(kept.goal, goals)
+    np.testing.assert_array_equal(kept.seen[0], view.obs)
+    log_p = log_prior(CONFIG, params, view)
+    divergence = greedy_divergence(jnp.float32(epsilon), best, log_p)
+    np.testing.assert_allclose(kept.divergence, divergence, rtol=1e-5)
+
+
+def test_it_explores_in_the_search_and_is_judged_without(params):
+    adapter = learner(PtgmHyper(epsilon=0.25), params).adapter()
+    state = adapter.init(jax.random.key(0), jnp.zeros(CONFIG.goal_dim))
+    assert adapter.ask(jax.random.key(1), state)[0].epsilon == 0.25
+    assert adapter.best(state).epsilon == 0
+
+
+def test_the_high_level_sees_what_its_settings_say(params, view):
+    goal = jnp.arange(CONFIG.goal_dim, dtype=jnp.float32)
+    for reads, part in (("observation", view.obs), ("history", view.features)):
+        alone, beside = (
+            learner(PtgmHyper(reads=reads, sees_goal=sees), params)._seen(view, goal)
+            for sees in (False, True)
+        )
+        np.testing.assert_array_equal(alone, part)
+        np.testing.assert_array_equal(beside, [*part, *goal])
+
+
+def test_the_divergence_from_the_prior_is_taken_off_the_rewards(params):
+    """Of seven steps that pay 1 each, with a decision every third."""
+    agent = learner(PtgmHyper(kl=0.5), params)
+    agent._update = lambda key, state: state  # nothing is learned
+    state = agent.init(jax.random.key(0), jnp.zeros(CONFIG.goal_dim))
+    num = ENV.spec.horizon // 3
+    away = jnp.arange(1.0, num + 1)
+    kept = Kept(jnp.zeros((num, CONFIG.embed_dim)), jnp.zeros(num, jnp.int32), away)
+    rewards = [1.0] * 7 + [0.0] * (ENV.spec.horizon - 7)
+    episodes = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], episode_of(rewards, 7, kept))
+    choice, _ = agent.ask(jax.random.key(1), state)
+    after = agent.tell(jax.random.key(1), state, choice, episodes)
+    assert after.replay.size == 3
+    np.testing.assert_allclose(after.replay.rows.reward[:3], [3 - 0.5, 3 - 1.0, 1 - 1.5])
 
 
 def test_lanes_side_by_side_equal_lanes_alone(params):

@@ -15,6 +15,7 @@ import pytest
 
 import envs
 from experiments.release import command
+from experiments.store.cards import cpu_minutes
 from experiments.store.settings import PretrainConfig
 from mgpo_jax.files import to_json
 from mgpo_jax.policy_files import load_policy, save_policy
@@ -218,3 +219,8 @@ def test_requests_that_are_refused(run: Path, release: Release) -> None:
     (run / "policy" / "config.json").unlink()
     code, text = release()
     assert (code, "no finished policy" in text) == (2, True), text
+
+
+def test_the_minutes_of_a_training_are_those_of_its_steps() -> None:
+    rows = [{"step": 60, "cpu_seconds_per_step": 0.5}, {"step": 120, "cpu_seconds_per_step": 1.0}]
+    assert cpu_minutes(rows) == pytest.approx(1.5)

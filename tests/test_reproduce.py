@@ -247,6 +247,20 @@ def test_budgets_are_those_of_the_worlds_preset() -> None:
     assert "ablation" not in envs.find("gridworld").presets
 
 
+def test_cells_of_table1_have_the_units_of_their_columns() -> None:
+    folder = Path("results/maze15/ucb").absolute()
+    summary = read_summary(folder)
+    text = comparisons.as_table([comparisons.Cell("maze15", "ucb", folder)])
+    head, _, row = (
+        [cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()[:3]
+    )
+    cells = dict(zip(head, row, strict=True))
+    assert float(cells["CPU-minutes"]) == pytest.approx(summary["cpu_seconds"] / 60, abs=0.051)
+    best = float(cells["best single episode"])
+    assert best == pytest.approx(summary["best_episode_return"], abs=0.0051)
+    assert best > summary["final_return"]
+
+
 def test_the_plan_is_tried_without_each_of_its_parts(
     tiny: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

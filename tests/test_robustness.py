@@ -14,6 +14,7 @@ from envs.errors import DataError, UsageError
 from experiments import comparisons, robustness
 from experiments.comparisons import Cell
 from experiments.evaluation import Noise
+from experiments.robustness import Behind, Row
 from experiments.store.settings import ReproduceConfig
 from experiments.store.summary import read_summary
 
@@ -92,6 +93,16 @@ def test_missing_rows_are_measured_once(unpublished: list[Noise], tmp_path: Path
     again = robustness.compare(config)
     assert unpublished == [Noise(action=0.1)]
     assert again.splitlines()[:10] == text.splitlines()[:10]
+
+
+def test_the_cost_of_a_row_is_in_minutes() -> None:
+    for cost, cell in ((90.0, "1.5"), (None, "")):
+        found = Behind.model_validate(measured(Noise(obs=0.01), cpu_seconds=cost))
+        text = robustness.as_table([Row("kitchen", "ucb", Noise(obs=0.01), found)])
+        head, _, row = (
+            [word.strip() for word in line.split("|")[1:-1]] for line in text.splitlines()[:3]
+        )
+        assert dict(zip(head, row, strict=True))["CPU-minutes"] == cell
 
 
 def test_a_row_of_another_adaptation_is_not_used(unpublished: list[Noise], tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from test_ptgm import rule_of
 
 import envs
 from envs.base import Trajectory
@@ -19,6 +20,7 @@ from envs.registry import Judgement
 from mgpo_jax import methods
 from mgpo_jax.adaptation import search
 from mgpo_jax.baselines import skills
+from mgpo_jax.baselines import spirl as spirl_module
 from mgpo_jax.baselines.hierarchy import Transitions
 from mgpo_jax.baselines.methods import SpirlHyper
 from mgpo_jax.baselines.skills import (
@@ -194,6 +196,21 @@ def test_before_the_first_update_the_prior_acts(params):
         np.testing.assert_array_equal(mine.trajectory.actions, other.trajectory.actions)
 
 
+def test_it_explores_in_the_search_and_is_judged_by_the_means(params):
+    agent = spirl(SpirlHyper(), params)
+    state = agent.init(jax.random.key(0), jnp.zeros(ENV.spec.goal_dim))
+    seen = jax.random.normal(jax.random.key(1), (OPEN.embed_dim,))
+    policy, key = agent.policy(state.weights.actor, seen), jax.random.key(2)
+    tried, _ = agent.adapter().ask(jax.random.key(3), state)
+    judged = agent.adapter().best(state)
+    for choice, wanted in ((tried, policy.sample(key)), (judged, policy.mean)):
+        latent, kept = rule_of(spirl_module, agent, state, choice)(key, seen, None)
+        np.testing.assert_array_equal(latent, wanted)
+        np.testing.assert_array_equal(kept.latent, latent)
+        np.testing.assert_array_equal(kept.seen, seen)
+    assert np.abs(policy.sample(key) - policy.mean).max() > 1e-3
+
+
 def one_state(params: Any, latents: jax.Array, rewards: jax.Array) -> Transitions:
     num = len(latents)
     seen = jnp.zeros((num, OPEN.embed_dim))
@@ -259,6 +276,42 @@ def test_the_value_of_the_next_decision_is_discounted_once(params):
     values = agent.values(state.weights.critics, jnp.stack([first, second]), latents)
     np.testing.assert_allclose(values[:, 1], 1.0, atol=0.05)
     np.testing.assert_allclose(values[:, 0], 0.9, atol=0.08)
+
+
+def test_the_target_is_the_smaller_value_and_pays_for_the_divergence(params):
+    """By a step of plain gradient descent on the error of both critics, away from the prior."""
+    agent = spirl(SpirlHyper(alpha=2.0, discount=0.9), params)
+    agent.optimize = optax.sgd(1.0)
+    state = agent.init(jax.random.key(0), jnp.zeros(ENV.spec.goal_dim))
+    actor = jax.tree.map(lambda leaf: leaf + 0.05, state.weights.actor)
+    weights = state.weights._replace(actor=actor)
+    state = state._replace(weights=weights, opt_state=agent.optimize.init(weights))
+    seen, then = jax.random.normal(jax.random.key(1), (2, 16, OPEN.embed_dim))
+    latents = jax.random.normal(jax.random.key(2), (16, OPEN.latent_dim))
+    rewards, done = jnp.arange(16.0), jnp.arange(16) == 0
+    now = Transitions(Kept(seen, latents), rewards, done, jnp.ones(16, bool))
+    key = jax.random.key(5)
+    policy = agent.policy(actor, then)
+    drawn = policy.sample(jax.random.split(key)[0])
+    # The second target critic is moved so that each of the two is the smaller one somewhere.
+    ahead = jnp.median(jnp.diff(agent.values(state.target, then, drawn), axis=0))
+    target = jax.tree.map(jnp.copy, state.target)
+    target["params"]["Dense_3"]["bias"] -= jnp.array([[0.0], [ahead]])
+    state = state._replace(target=target)
+    both = agent.values(target, then, drawn)
+    assert np.unique(jnp.argmin(both, axis=0)).tolist() == [0, 1]
+    away = agent.divergence(policy, then)
+    assert (away > 1e-3).all()
+    wanted = rewards + jnp.where(done, 0.0, 0.9 * (both.min(axis=0) - 2.0 * away))
+    after = jax.jit(agent.improved)(key, state, now, now._replace(kept=Kept(then, latents)))
+
+    def loss(critics: Any) -> jax.Array:
+        return jnp.mean((agent.values(critics, seen, latents) - wanted) ** 2, axis=1).sum() / 2
+
+    grads = jax.grad(loss)(weights.critics)
+    expected = jax.tree.map(lambda leaf, grad: leaf - grad, weights.critics, grads)
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)  # noqa: E731
+    jax.tree.map(close, after.weights.critics, expected)
 
 
 def test_it_updates_once_for_every_decision_after_the_warm_up(params):

@@ -181,8 +181,25 @@ def test_what_a_policy_makes_of_a_demonstration(name, demonstrates, monkeypatch)
     # Policies act there as the world judges them.
     monkeypatch.setattr(training, "judged_query", noted)
     world = replace(world, judged=Judgement("sample", 0.5, episodes=3) if demonstrates else GREEDY)
-    found = ReturnsOnTheWay(world, env, config, demonstrator, 4)(params)
+    evaluated = ReturnsOnTheWay(world, env, config, demonstrator, 4)
+    found = evaluated(params)
     assert set(asked) == {world.judged}
     assert ("eval/followed_return" in found) == demonstrates
     assert all(np.isfinite(value) for value in found.values())
     assert found["eval/initial_return"] < 0.9
+    check_what_is_reported(evaluated, params, demonstrates)
+
+
+def check_what_is_reported(evaluated, params, demonstrates):
+    """As if the return of an episode were a tenth of the number of goals in its prompt."""
+    evaluated._returns = lambda params, keys, tasks, prompts: prompts.mask.sum(axis=-1) / 10
+    if demonstrates:  # the last of four demonstrations does not count, and has the longest prompt
+        mask = evaluated._followed.mask.at[0, :].set(jnp.arange(5) >= 3).at[3].set(True)
+        evaluated._followed = evaluated._followed._replace(mask=mask)
+        evaluated._perfect = np.array([True, True, True, False])
+        shares = np.asarray(mask[:3]).sum(axis=-1) / 10
+    found = evaluated(params)
+    assert found["eval/initial_return"] == pytest.approx(0.1)
+    assert found["eval/initial_regret"] == pytest.approx(np.mean(evaluated.optimum) - 0.1)
+    if demonstrates:
+        assert found["eval/followed_return"] == pytest.approx(shares.mean()) != 0.1

@@ -15,6 +15,7 @@ from scipy import special, stats
 from envs.base import Trajectory
 from envs.errors import UsageError
 from mgpo_jax.dataset import BatchPlan, Dataset
+from mgpo_jax.distributions import Gaussian
 from mgpo_jax.prompts import hindsight_outcome, sample_prompt
 from mgpo_jax.settings import TrainConfig
 from mgpo_jax.sharding import device_mesh
@@ -25,6 +26,8 @@ from mgpo_jax.training import (
     bc_loss,
     blurred,
     learning_rate_schedule,
+    make_optimizer,
+    stats_of,
 )
 from mgpo_jax.transformer import GoalTransformer, TransformerConfig
 
@@ -293,3 +296,59 @@ def test_noise_is_finite_and_not_negative(size):
 def test_devices_must_divide_the_parts():
     with pytest.raises(UsageError, match="part_size 3 does not divide over 2 devices"):
         Trainer(replace(CONFIG, part_size=3), NETWORK, DATASET, device_mesh(2))
+
+
+@pytest.fixture(scope="module")
+def first_update(params):
+    """``(gradients, changes of the settings) -> (update, state)`` of an optimizer at a constant rate."""
+    flat, unravel = ravel_pytree(params)
+
+    def update(grads, **changes):
+        config = replace(CONFIG, warmup_steps=0, schedule="constant", **changes)
+        optimizer = make_optimizer(config, unravel)
+        return jax.jit(optimizer.update)(grads, optimizer.init(flat), flat)
+
+    return update
+
+
+def test_gradients_are_clipped(params, first_update):
+    """AdamW's first moment is a tenth of the gradient that it is given."""
+    flat, _ = ravel_pytree(params)
+    grads = jnp.linspace(-1.0, 1.0, len(flat))
+    norm = float(jnp.linalg.norm(grads))
+    for bound, wanted in ((0.1, 0.1), (2 * norm, norm)):
+        _, state = first_update(grads, optimizer="adamw", clip_norm=bound)
+        np.testing.assert_allclose(jnp.linalg.norm(state[1][0].mu), 0.1 * wanted, rtol=1e-4)
+
+
+def test_muon_updates_the_matrices_of_the_blocks_and_adamw_the_rest(params, first_update):
+    """AdamW's first update has one size everywhere, whatever the gradient; Muon's is as large in the
+    root mean square as those of AdamW are later. Both have Nesterov momentum."""
+    flat, unravel = ravel_pytree(params)
+    noise = jax.random.normal(jax.random.key(0), flat.shape)
+    updates, _ = first_update(noise, optimizer="muon", weight_decay=0.0, learning_rate=0.01)
+    momentum = 1 + 0.9 * 0.1 / (1 - 0.9**2)
+    num_matrices = 0
+    for path, update in jax.tree_util.tree_leaves_with_path(unravel(updates)):
+        if "blocks" in jax.tree_util.keystr(path) and update.ndim == 2:
+            num_matrices += 1
+            size = float(jnp.sqrt(jnp.mean(update**2)))
+            assert size == pytest.approx(0.2 * 0.01, rel=0.2), path
+        else:
+            np.testing.assert_allclose(jnp.abs(update), momentum * 0.01, rtol=1e-3, err_msg=path)
+    assert num_matrices >= 4
+
+
+@pytest.mark.parametrize("name", ["muon", "adamw"])
+def test_all_weights_decay(name, params, first_update):
+    flat, _ = ravel_pytree(params)
+    zero = jnp.zeros_like(flat)
+    updates, _ = first_update(zero, optimizer=name, weight_decay=0.5, learning_rate=0.01)
+    np.testing.assert_allclose(updates, -0.01 * 0.5 * flat, rtol=1e-3, atol=1e-7)
+
+
+def test_a_continuous_action_is_hit_where_all_of_its_dimensions_are():
+    labels = jnp.array([[0.0, 0.0], [0.0, 0.5], [0.05, -0.05], [0.12, 0.0], [0.0, 0.0]])
+    blank = Gaussian(jnp.zeros((5, 2)), jnp.zeros((5, 2)))
+    found = stats_of(blank, labels, jnp.array([True, True, True, True, False]))
+    assert (found.correct, found.num_steps) == (2, 4)
