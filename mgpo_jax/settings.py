@@ -182,7 +182,8 @@ class TrainConfig:
     batch_size: BatchSize = 64
     """Number of trajectories in a gradient step [64]."""
     optimizer: Literal["muon", "adamw"] = "muon"
-    """Muon on the matrices of the blocks and AdamW on the rest, or AdamW alone [adamw]."""
+    """Muon on the matrices of the blocks and AdamW with Nesterov momentum on the rest, or AdamW alone
+    [adamw]."""
     learning_rate: Annotated[float, Gt(0), Le(100)] = 3e-3
     """Peak learning rate [1e-4]."""
     warmup_steps: Index = 300

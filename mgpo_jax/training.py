@@ -129,7 +129,8 @@ def make_optimizer(
     """The optimizer of a training run, for weights that are raveled into one vector.
 
     Muon (Jordan 2024) orthogonalizes the update of each matrix. Its updates are scaled to AdamW's root mean
-    square (Liu et al. 2025), so that both optimizers use the same learning rate.
+    square (Liu et al. 2025), so that both optimizers use the same learning rate. With ``muon``, the weights
+    that are not matrices of the blocks are updated by AdamW with Nesterov momentum, as optax has it.
 
     Args:
       config: the training config.
