@@ -502,17 +502,20 @@ def test_likeness_counts_goals_and_orders():
     assert likeness(made(one), made(three)) < order < 1
 
 
+CHANCY = SearchSpace(
+    num_slots=4,
+    horizon=5,
+    return_range=(0.0, 1.0),
+    num_episodes=8,
+    sample_goal=lambda key: jnp.zeros(2),
+    deterministic=False,
+)
+"""A search in a world in which one prompt has many returns."""
+
+
 def test_a_posterior_is_that_of_a_gaussian_process():
     keys = jax.random.split(jax.random.key(0), 6)
-    space = SearchSpace(
-        num_slots=4,
-        horizon=5,
-        return_range=(0.0, 1.0),
-        num_episodes=8,
-        sample_goal=lambda key: jnp.zeros(2),
-        deterministic=False,
-    )
-    optimizer = plan_worth(space)
+    optimizer = plan_worth(CHANCY)
     state = optimizer.init(keys[0], jnp.ones(2))
     returns = [0.1, 0.9, 0.4, 0.7, 0.2]
     prompts = []
@@ -555,15 +558,7 @@ def candidates(monkeypatch):
 def test_the_candidate_with_the_largest_draw_is_run(candidates):
     """One of known worth, and as often one that may be worth more or less."""
     drawn, believe = candidates
-    space = SearchSpace(
-        num_slots=4,
-        horizon=5,
-        return_range=(0.0, 1.0),
-        num_episodes=8,
-        sample_goal=lambda key: jnp.zeros(2),
-        deterministic=False,
-    )
-    optimizer = plan_worth(space)
+    optimizer = plan_worth(CHANCY)
     state = optimizer.init(jax.random.key(0), jnp.ones(2))._replace(size=jnp.int32(1))
     keys = jax.random.split(jax.random.key(1), 64)
 
