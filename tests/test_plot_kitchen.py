@@ -109,7 +109,7 @@ def test_prompts_side_by_side(found, titles, monkeypatch, tmp_path):
     save(tmp_path / "video.gif")
     ((path, (title, panels)),) = drawn.items()
     assert path == tmp_path / "video.gif"
-    order = "Task (the order is hidden from the policy): light, microwave"
+    order = "Task, in a hidden order: light, microwave"
     assert title == f"{order}  (\N{CHECK MARK} done in order)"
     assert [panel.title for panel in panels] == [f"Initial prompt, return 0.00\n{SET}", *titles]
     for panel in panels:

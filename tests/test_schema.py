@@ -179,7 +179,7 @@ def test_encrypted_members(path: Path) -> None:
 
 def test_bombs_are_not_unpacked(path: Path) -> None:
     np.savez_compressed(path, rows=np.zeros(1 << 30, np.uint8))
-    with pytest.raises(DataError, match="claims 1024 MB of arrays in a file of 0 MB"):
+    with pytest.raises(DataError, match="declares 1024 MB of arrays in a file of 0 MB"):
         read_arrays(path, {"rows": ArrayField(("step",), "integers")})
 
 
@@ -194,7 +194,7 @@ def test_an_array_of_an_expected_size_is_no_bomb(
     assert path.stat().st_size * 100 < frames.nbytes
     fields = {"obs": ArrayField(("step", 84, 84), "uint8")}
     for sizes in (None, {"step": range(1, 2**31)}):
-        with pytest.raises(DataError, match="claims 5 MB of arrays in a file of"):
+        with pytest.raises(DataError, match="declares 5 MB of arrays in a file of"):
             read_arrays(path, fields, sizes)
     with pytest.raises(DataError, match=r"wanted \[step 799, 84, 84\]"):
         read_arrays(path, fields, {"step": 799})

@@ -36,7 +36,7 @@ def write_video(path: Path, task: Task, shown: Sequence[Shown]) -> None:
       UsageError: if there is no OpenGL for rendering.
     """
     order = [NAMES[subtask] for subtask in task.order if subtask != NONE]
-    title = f"Task (the order is hidden from the policy): {', '.join(order)}  ({IN_ORDER} done in order)"
+    title = f"Task, in a hidden order: {', '.join(order)}  ({IN_ORDER} done in order)"
     try:
         kitchen_gif(path, title, [panel_of(each) for each in shown])
     except NoOpenGLError as error:
