@@ -47,7 +47,7 @@ def assert_full(done: Ended, out: str) -> None:
     errors = [line for line in done.lines if "rror" in line]
     assert len(errors) == 1, done.err
     assert errors[0].startswith("error: ")
-    assert "room" in errors[0]
+    assert "space" in errors[0]
     assert out in errors[0]
     assert "--resume" in errors[0]
 
