@@ -51,7 +51,8 @@ class Outcome(NamedTuple):
     """``[S, N, C]``: mean return of the judging episodes. The first judgement is that of the initial
     choice."""
     num_episodes: int
-    """Number of all episodes that were run, including those that judged."""
+    """Number of all episodes of the searches, including those that judged. Lanes that only pad the last
+    group do not count."""
     num_failed: int
     """Number of episodes that ended because the simulation failed."""
     cpu_seconds: float

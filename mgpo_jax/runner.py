@@ -162,7 +162,7 @@ def sweep(
     # The judgement of the initial choice is recorded at episode 1, since a search begins by evaluating it.
     after = np.concatenate([[1], np.cumsum(segments) * num])
     per_lane = episodes + (len(segments) + 1) * setting.judged.episodes
-    total, cpu = round(layout.num_lanes * per_lane / grid.variants), cpu / grid.variants
+    total, cpu = seeds * grid.tasks * per_lane, cpu / grid.variants
     return [record.outcome(i, grid, after, total, cpu) for i in range(grid.variants)]
 
 
