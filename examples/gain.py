@@ -23,10 +23,10 @@ def judged(folder: Path, index: int) -> np.ndarray:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(usage=__doc__)
     parser.add_argument("runs", type=Path, nargs="+")
-    parser.add_argument("--minus", type=Path)
-    parser.add_argument("--minus-initial", type=Path)
+    other = parser.add_mutually_exclusive_group()
+    other.add_argument("--minus", type=Path)
+    other.add_argument("--minus-initial", type=Path)
     args = parser.parse_args()
     for run in args.runs:
-        other = args.minus or args.minus_initial or run
-        before = judged(other, -1 if args.minus else 0)
+        before = judged(args.minus or args.minus_initial or run, -1 if args.minus else 0)
         print(f"{run}: {gain_over_tasks(judged(run, -1), before)}")

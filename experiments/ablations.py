@@ -17,7 +17,7 @@ from envs.errors import NotAvailableError, nearest
 from experiments.adaptation import adapt_all, deciding, save_outcome
 from experiments.drawing import write
 from experiments.figures import later, learning_curve
-from experiments.signals import farewell
+from experiments.signals import GO_ON, farewell, kept
 from experiments.store import runs
 from experiments.store.paper import paper_value
 from experiments.store.policies import check_weights
@@ -44,7 +44,6 @@ from mgpo_jax.policy_files import load_policy
 from mgpo_jax.tasks import test_tasks
 
 EPISODES = 100  # episodes of an adaptation
-GO_ON = "run the same command again to continue"
 UNFINISHED = "unfinished-"  # prefix of folders with the finished pieces of an unfinished adaptation
 LONGEST = 5  # maximum number of goals in a prompt where the paper varies c
 
@@ -146,7 +145,7 @@ def adapted(
     complete = all(map(Path.exists, folders))
     if complete and not pieces.exists():
         return
-    with claimed(pieces), farewell(lambda: f"stopped; finished work is kept; {GO_ON}"):
+    with claimed(pieces), farewell(kept):
         if not complete:
             print(f"adapting with {policy_folder or 'the released policy'}", file=sys.stderr)
             journal, meta = open_journal(pieces, variants, provenance())

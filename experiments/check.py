@@ -96,9 +96,7 @@ def check(names: Sequence[str], out: Path | None) -> None:
     broken = [name for name, report in reports.items() if report.faults]
     if broken:
         raise DataError(
-            f"faults found in {', '.join(broken)}; fix those listed above before training on it"
-            if len(broken) == 1
-            else f"faults found in {', '.join(broken)}; fix those listed above before training on them"
+            f"faults found in {', '.join(broken)}; fix those listed above before any training"
         )
 
 

@@ -24,6 +24,7 @@ from experiments.drawing import pictures_together, write
 from experiments.figures import later, learning_curves
 from experiments.prompt_lengths import entropy_table
 from experiments.runtime import say
+from experiments.signals import GO_ON
 from experiments.store import runs
 from experiments.store.paper import paper_final, paper_worlds
 from experiments.store.results import Results, load_results
@@ -39,7 +40,6 @@ from mgpo_jax.policy_files import load_policy
 from mgpo_jax.tasks import num_tasks, test_tasks
 
 PUBLISHED = Path("results")
-GO_ON = "run the same command again to continue"
 SMOKE_TASKS, SMOKE_EPISODES = 5, 20
 
 

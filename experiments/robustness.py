@@ -19,7 +19,6 @@ from pydantic import BaseModel, Field
 
 from envs.errors import DataError, UsageError
 from experiments.comparisons import (
-    GO_ON,
     PUBLISHED,
     Cell,
     Notes,
@@ -32,7 +31,7 @@ from experiments.comparisons import (
     worlds_of,
 )
 from experiments.evaluation import OFFICIAL, Noise, evaluate_cases, open_case
-from experiments.signals import farewell
+from experiments.signals import farewell, kept
 from experiments.store.layout import SUMMARY
 from experiments.store.paper import paper_value
 from experiments.store.provenance import provenance
@@ -176,7 +175,7 @@ def rows_of(config: ReproduceConfig, world: str, method: str) -> Iterator[Row]:
                 cases[noise] = open_case(cell.results, None, [noise])
             except UsageError as error:  # a noise that this world does not have
                 rows[noise] = row._replace(reason=str(error))
-    with farewell(lambda: f"stopped; finished work is kept; {GO_ON}"):
+    with farewell(kept):
         spent = time.process_time()
         measured = evaluate_cases(list(cases.values()), num_episodes(config), 0) if cases else ()
         for noise, values in zip(cases, measured, strict=True):

@@ -28,6 +28,14 @@ SIGNALS = tuple(
 MOMENT = 1.0
 """Seconds that the main thread waits for the listener to end the process."""
 
+GO_ON = "run the same command again to continue"
+"""How to continue commands that skip what is finished, for messages."""
+
+
+def kept() -> str:
+    """The last words (``farewell``) of a command that skips what is finished when it is run again."""
+    return f"stopped; finished work is kept; {GO_ON}"
+
 
 class Stopped(KeyboardInterrupt):
     """Raised when a command stops because a signal asked it to; ``number`` is the signal's."""

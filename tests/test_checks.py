@@ -308,7 +308,7 @@ def test_the_command_checks_worlds(command) -> None:
     code, out, err = command("test_checks:BAD")
     assert code == 1
     assert "bad-track: 1 fault\n- " in out
-    assert "faults found in test_checks:BAD; fix those listed above before training on it\n" in err
+    assert "faults found in test_checks:BAD; fix those listed above before any training\n" in err
 
 
 BAD = World(name="bad-track", make=told(lambda s, t, a: {"reward": 3 * t.reward}), num_test_tasks=4)

@@ -1,8 +1,8 @@
 """Checks that a world fulfills the contract of every world: ``envs.check_world(world)``.
 
-The rules are those of ``envs/base.py``. First the functions of the world are traced (``definitions``). Then a
-few episodes are run beyond their horizon (``episodes``) and checked (``rules``): half of them with the
-world's first demonstrator, if it has one, and the others with random actions. Each violation becomes a
+The rules are those of ``envs/base.py``. First the functions of the world are traced (``definitions``).
+Then a few episodes are run beyond their horizon (``episodes``) and checked (``rules``): half of them with
+the world's first demonstrator, if it has one, and the others with random actions. Each violation becomes a
 sentence that names the step which shows it. Rules that depend on a violated one are skipped.
 """
 
