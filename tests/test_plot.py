@@ -209,7 +209,7 @@ def test_learning_curve_is_mean_over_tasks_and_std_over_seeds():
     corners = ax.collections[0].get_paths()[0].vertices
     assert corners[:, 1].max() == pytest.approx(0.0)
     assert corners[corners[:, 0] == 20, 1].min() == pytest.approx(-0.5)
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("episodes", "return of the optimized prompt")
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("episodes", "evaluation return")
 
 
 def test_no_line_of_an_unknown_optimum():

@@ -15,10 +15,13 @@ from experiments.store.statistics import performance_profile
 if TYPE_CHECKING:
     from experiments.store.results import Results
 
+RETURN = "evaluation return"
+"""Label of the return in evaluation episodes, of an optimized prompt or of a learned policy."""
+
 
 @styled
 def learning_curve(results: Mapping[str, Results], title: str | None = None) -> Figure:
-    """Figures 6 and 7: return of the optimized prompt over the episodes of adaptation.
+    """Figures 6 and 7: return of the optimized prompt, or of the learned policy, over the episodes.
 
     Lines are means over tasks and seeds, bands the standard deviation over seeds. The optimum is drawn if
     it is known.
@@ -36,7 +39,7 @@ def learning_curves(results: Mapping[str, Mapping[str, Results]]) -> Figure:
     panels = figure.subplots(1, len(results), squeeze=False)[0]
     for ax, (world, of_world) in zip(panels, results.items(), strict=True):
         _draw_curves(ax, of_world, world)
-        ax.set_ylabel("" if ax is not panels[0] else "return of the optimized prompt")
+        ax.set_ylabel("" if ax is not panels[0] else RETURN)
     entries = {
         label: line
         for ax in panels
@@ -66,7 +69,7 @@ def _draw_curves(ax: Any, results: Mapping[str, Results], title: str | None) -> 
         ax.axhline(
             optimum, color=INK, linestyle=(0, (4, 3)), linewidth=1.0, label=label, zorder=1.8
         )
-    ax.set(xlabel="episodes", ylabel="return of the optimized prompt", title=plain(title or ""))
+    ax.set(xlabel="episodes", ylabel=RETURN, title=plain(title or ""))
     ax.set_xlim(left=0)
     ax.margins(y=0.08)
 
