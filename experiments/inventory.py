@@ -24,7 +24,9 @@ from experiments.comparisons import (
     worlds_of,
 )
 from experiments.store import runs
+from experiments.store.layout import META
 from experiments.store.metrics import METRICS, read_metrics
+from experiments.store.provenance import read_meta
 from experiments.store.settings import (
     ABLATIONS,
     COMPARISONS,
@@ -35,7 +37,7 @@ from experiments.store.settings import (
     ReproduceConfig,
     file_name,
 )
-from experiments.store.summary import read_summary
+from experiments.store.summary import ADAPT_AGAIN, read_summary
 from experiments.store.tables import table
 from mgpo_jax import methods
 from mgpo_jax.methods import Method
@@ -135,7 +137,7 @@ def _cell(config: ReproduceConfig, world: str, method: str) -> tuple[Cell, Piece
     settings = cell_config(config, world, method)
     folder = settings.folder if settings.folder.is_dir() else published(config, settings)
     if folder is not None:
-        piece = Piece(True, read_summary(folder)["cpu_seconds"])
+        piece = Piece(True, cpu_seconds_of(folder))
     elif settings.policy is not None and not runs.is_finished(settings.policy.parent):
         piece = Piece(False, None)  # the cost of training its policy is unknown
     else:
@@ -160,7 +162,7 @@ def _ablation_pieces(config: ReproduceConfig) -> Iterator[Piece]:
         if part.training is not None:
             trainings[part.training.folder] = part.training
         if part.results.is_dir():
-            yield Piece(True, read_summary(part.results)["cpu_seconds"])
+            yield Piece(True, cpu_seconds_of(part.results))
         else:
             settings = AdaptConfig(
                 env=config.world, seeds=config.seeds, episodes=ablations.EPISODES, hyper=part.hyper
@@ -239,9 +241,16 @@ def way_of(method: Method) -> tuple[str, type]:
 
 @cache
 def _rates_in(folder: Path) -> Mapping[str, float]:
-    """CPU-seconds per episode of the adaptations in a folder, by method."""
+    """CPU-seconds per episode of the adaptations in a folder that ran on CPUs, by method."""
+    folders = {name: folder / file_name(name) for name in methods.names()}
     return {
-        name: 1 / read_summary(folder / file_name(name))["episodes_per_cpu_second"]
-        for name in methods.names()
-        if (folder / file_name(name)).is_dir()
+        name: 1 / read_summary(path)["episodes_per_cpu_second"]
+        for name, path in folders.items()
+        if path.is_dir() and cpu_seconds_of(path) is not None
     }
+
+
+def cpu_seconds_of(folder: Path) -> float | None:
+    """CPU-seconds of an adaptation; None if it ran on accelerators, which do most of its work."""
+    meta = read_meta(folder / META, ADAPT_AGAIN)
+    return read_summary(folder)["cpu_seconds"] if meta.on_cpus else None

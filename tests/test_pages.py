@@ -13,6 +13,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from made_results import TINY, made_results
@@ -216,7 +217,9 @@ def test_a_report_is_the_same_every_time_and_is_sealed(tmp_path: Path, result: P
         ], "goal": [5, 1]},
         "text": "goal at row 5, column 1",
     }  # fmt: skip
-    assert dict(data["runs"][0]["facts"])["tasks x seeds x episodes"] == "2 x 2 x 20"
+    facts = dict(data["runs"][0]["facts"])
+    assert facts["tasks x seeds x episodes"] == "2 x 2 x 20"
+    assert facts["devices"] == f"{jax.device_count()} x cpu"
 
 
 def test_an_adaptation_has_a_page_beside_its_pictures(

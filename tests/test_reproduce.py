@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -388,6 +389,18 @@ def test_prices_are_those_of_relatives() -> None:
         if path.name in methods.names()
     )
     assert rate("crafter", methods.find("ucb")) is None
+
+
+def test_a_gpu_says_nothing_about_cpu_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree("results/maze15/ucb", tmp_path / "maze15" / "ucb")
+    monkeypatch.setattr(inventory, "PUBLISHED", tmp_path)
+    rate, ucb = inventory.seconds_per_episode, methods.find("ucb")
+    assert rate("maze15", ucb) is not None
+    meta = tmp_path / "maze15" / "ucb" / "meta.json"
+    meta.write_text(json.dumps({**json.loads(meta.read_text()), "devices": ["cuda:0"]}))
+    inventory._rates_in.cache_clear()
+    assert rate("maze15", ucb) is None
+    assert inventory.cpu_seconds_of(tmp_path / "maze15" / "ucb") is None
 
 
 def test_table3_by_the_command(

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from experiments.store.provenance import Meta
 from experiments.store.runs import changes, identity, say_what_differs
 from experiments.store.settings import PretrainConfig
 
@@ -53,3 +54,13 @@ def test_a_run_is_known_by_what_decides_about_its_weights() -> None:
 def test_what_changed_is_told_by_name() -> None:
     assert changes({"a": 1, "b": 2}, {"a": 1, "b": 2}) == ""
     assert changes({"a": 1, "b": "x"}, {"a": 2, "c": 3}) == "a 1 -> 2; b 'x' -> None; c None -> 3"
+
+
+def test_the_hardware_in_words() -> None:
+    gpus = Meta(devices=["cuda:0", "cuda:1"], device_kinds=["NVIDIA H100 80GB HBM3"])
+    assert gpus.hardware == "2 x cuda (NVIDIA H100 80GB HBM3)"
+    assert not gpus.on_cpus
+    for cpu in ("cpu:0", "TFRT_CPU_0"):
+        assert Meta(devices=[cpu], device_kinds=["cpu"]).on_cpus
+    assert Meta(devices=["cpu:0"], device_kinds=["cpu"]).hardware == "1 x cpu"
+    assert Meta().on_cpus  # files of the first version record no devices

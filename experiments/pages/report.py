@@ -190,6 +190,7 @@ def _facts(results: Results, row: Row) -> list[tuple[str, str]]:
         ("weights", (summary.get("policy_sha256") or "")[:12]),
         ("command", " ".join(meta.command)),
         ("revision", meta.revision),
+        ("devices", meta.hardware),
         ("versions", ", ".join(f"{n} {v}" for n, v in meta.versions.items() if n in VERSIONS)),
         ("folder", row.folder),
     ]  # fmt: skip

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import subprocess
 import sys
+from collections import Counter
+from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,6 +16,7 @@ from typing import Annotated, Any
 from annotated_types import MaxLen
 from pydantic import BaseModel, StringConstraints
 
+from envs.errors import printable
 from mgpo_jax.schema import STRICT, read_document
 
 PACKAGES = (
@@ -35,11 +39,24 @@ class Meta(BaseModel):
     revision: str = ""
     versions: dict[str, str] = {}
     devices: list[str] = []
+    device_kinds: list[str] = []
+    """Models of the devices; absent in the files of older versions."""
     dataset: Place | None = None
     """Folder of the dataset of a training."""
     dataset_sha256: str = ""
     policy_places: Annotated[list[Place], MaxLen(8)] = []
     """Folder of the policy of an adaptation: relative to the results, and absolute."""
+
+    @property
+    def on_cpus(self) -> bool:
+        """Whether all devices are CPUs; true as well if they are not recorded."""
+        return all("cpu" in device.lower() for device in self.devices)
+
+    @property
+    def hardware(self) -> str:
+        """The devices in words, such as ``2 x cpu`` or ``1 x cuda (NVIDIA H100 80GB HBM3)``."""
+        models = [printable(model) for model in self.device_kinds if model != "cpu"]
+        return count_devices(self.devices) + (f" ({', '.join(models)})" if models else "")
 
 
 def read_meta(path: Path, mend: str) -> Meta:
@@ -49,6 +66,12 @@ def read_meta(path: Path, mend: str) -> Meta:
       DataError: if the file is damaged.
     """
     return read_document(path, Meta, mend) if path.exists() else Meta()
+
+
+def count_devices(devices: Sequence[Any]) -> str:
+    """The number of devices of each platform, such as ``2 x cpu``."""
+    names = Counter(printable(re.sub(r"[_:]\d+$", "", str(device))) for device in devices)
+    return ", ".join(f"{num} x {name}" for name, num in sorted(names.items()))
 
 
 def versions() -> dict[str, str]:
@@ -78,5 +101,6 @@ def provenance() -> dict[str, Any]:
         "revision": revision,
         "versions": versions(),
         "devices": [str(device) for device in jax.devices()],
+        "device_kinds": sorted({device.device_kind for device in jax.devices()}),
         "cpu_count": os.cpu_count(),
     }

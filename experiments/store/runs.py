@@ -11,16 +11,15 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import re
 import shutil
 import sys
-from collections import Counter
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Set
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from envs.errors import DataError, UsageError, printable, shown
+from envs.errors import DataError, UsageError, shown
+from experiments.store.provenance import count_devices
 from experiments.store.settings import (
     DEFAULT_WORLD,
     INIT,
@@ -308,7 +307,7 @@ def say_what_differs(saved: dict[str, Any], now: dict[str, Any], what: str) -> N
     """
     differs = []
     if isinstance(saved.get("devices"), list):
-        devices, devices_now = _count_devices(saved["devices"]), _count_devices(now["devices"])
+        devices, devices_now = count_devices(saved["devices"]), count_devices(now["devices"])
         if devices != devices_now:
             differs.append(f"{devices} (now {devices_now})")
     if isinstance(saved.get("versions"), dict):
@@ -321,9 +320,3 @@ def say_what_differs(saved: dict[str, Any], now: dict[str, Any], what: str) -> N
     if differs:
         text = f"{what} was begun with {', '.join(differs)}: the result may differ in its last bits"
         print(text, file=sys.stderr)
-
-
-def _count_devices(devices: Sequence[Any]) -> str:
-    """The number of devices of each kind, such as ``2 x TFRT_CPU``."""
-    kinds = Counter(printable(re.sub(r"[_:]\d+$", "", str(device))) for device in devices)
-    return ", ".join(f"{num} x {kind}" for kind, num in sorted(kinds.items()))
