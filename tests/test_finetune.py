@@ -416,6 +416,35 @@ def test_the_penalty_is_for_leaving_the_pre_trained_policy(
     assert np.abs(later.before.logits - first.before.logits).max() > 1e-2
 
 
+def test_the_penalty_weighs_by_the_policy_and_not_by_the_pre_trained_one(
+    params: Any, round_of_episodes: Any
+) -> None:
+    """The first moment of Adam is a tenth of the gradient of sum_a pi(a) log(pi(a) / pi_0(a))."""
+    _, state, query, episodes = round_of_episodes
+    without_loss = Round(lambda batch: lambda now, batch: jnp.zeros(()))
+    tuner = Finetuner(SETTING, params, PpoHyper(kl=1.0, clip_norm=1e9), without_loss)
+    noise = lambda leaf: 0.3 * jax.random.normal(jax.random.key(leaf.size), leaf.shape)  # noqa: E731
+    policy = jax.tree.map(lambda leaf: leaf + noise(leaf), params)
+    moved = state._replace(weights=state.weights._replace(policy=policy))
+    batch = jax.jit(tuner._batch)(moved, query, episodes)
+
+    def log_probs(weights: Any) -> jax.Array:
+        one = lambda *own: GoalTransformer(NETWORK).apply(weights, query.prompt, *own).logits  # noqa: E731
+        return jax.nn.log_softmax(jax.vmap(one)(batch.obs, batch.actions))
+
+    def penalty(weights: Any, weighs_first: bool) -> jax.Array:
+        now, before = log_probs(weights), log_probs(params)
+        first, second = (now, before) if weighs_first else (before, now)
+        divergences = jnp.sum(jnp.exp(first) * (first - second), axis=-1)
+        return divergences[batch.real].mean()
+
+    told = jax.jit(tuner.tell)(jax.random.key(4), moved, query, episodes)
+    moments = optax.tree.get(told.opt_state.inner_states["policy"], "mu").policy
+    right, wrong = (jax.grad(penalty)(policy, weighs_first) for weighs_first in (True, False))
+    assert_close(moments, jax.tree.map(lambda leaf: 0.1 * leaf, right), 1e-5)
+    assert optax.tree.norm(optax.tree.sub(right, wrong)) > 0.1 * optax.tree.norm(right)
+
+
 def test_a_strong_penalty_keeps_the_policy(params: Any, round_of_episodes: Any) -> None:
     _, _, query, episodes = round_of_episodes
     hyper = PpoHyper(learning_rate=1e-3, epochs=100)
