@@ -53,6 +53,8 @@ class TestMissingPackage:
 
 
 pytest.importorskip("craftax")
+from craftax.craftax_classic.constants import SOLID_BLOCKS  # noqa: E402
+
 from envs.crafter import rules  # noqa: E402
 from envs.crafter.env import Crafter, CrafterState, CrafterTask  # noqa: E402
 from envs.crafter.pictures import crafter_pictures, unlocks_of, way_of  # noqa: E402
@@ -63,13 +65,18 @@ from envs.crafter.view import (  # noqa: E402
     ASLEEP,
     BLOCKS,
     COLUMNS,
+    FLOWN_OVER,
     LIGHT,
     NUM_BLOCKS,
     NUM_CELLS,
     NUM_CODES,
     NUM_COUNTS,
     OBS_SIZE,
+    PLACE_AMONG_POSSIBLE,
+    PLACED,
+    POSSIBLE,
     ROWS,
+    WALKED,
 )
 from envs.drawing import Shown  # noqa: E402
 from envs.episodes import Agent, run_episode  # noqa: E402
@@ -196,6 +203,7 @@ def test_observations(played):
     assert (codes == codes.astype(int)).all()
     assert (codes >= 0).all()
     assert (codes < NUM_CODES).all()
+    assert np.isin(codes, POSSIBLE).all()
     assert (counts == counts.astype(int)).all()
     assert (counts >= 0).all()
     assert (counts <= 9).all()
@@ -243,6 +251,20 @@ def test_places(played):
             np.testing.assert_array_equal(unlocked[23:], way[step])
             num_unlocked += 1
     assert num_unlocked > 3
+
+
+def test_the_possible_codes_follow_from_the_rules():
+    """Mobs stay off lava and what is solid; arrows fly over water and lava, and may get a block below."""
+    solid = {BLOCKS[index] for index in np.asarray(SOLID_BLOCKS)}
+    open_ = set(BLOCKS) - solid - {"invalid", "out_of_bounds", "wood"}  # no map has these
+    assert set(WALKED) == open_ - {"lava"}
+    assert set(FLOWN_OVER) == open_ | {"water"}
+    assert set(PLACED) == {"stone", "crafting_table", "furnace", "plant"} <= solid
+    assert len(POSSIBLE) == len(set(POSSIBLE)) == 17 + 3 * 3 + 4 * (9 + 3 * 3)
+    np.testing.assert_array_equal(POSSIBLE[PLACE_AMONG_POSSIBLE[POSSIBLE]], POSSIBLE)
+    np.testing.assert_array_equal(
+        POSSIBLE[PLACE_AMONG_POSSIBLE] % NUM_BLOCKS, np.arange(NUM_CODES) % NUM_BLOCKS
+    )
 
 
 def test_mobs_appear_by_night(key):

@@ -19,10 +19,12 @@ from envs.crafter.view import (
     LAYOUT,
     LIGHT,
     MAX_COUNT,
+    NUM_BLOCKS,
     NUM_CELLS,
     NUM_CODES,
     NUM_COUNTS,
     OBS_SIZE,
+    POSSIBLE,
 )
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.prompts import Prompt
@@ -33,10 +35,10 @@ WIDTH = 5
 
 
 def observations(number=64, *, light=None, asleep=0.0, seed=0):
-    """Random ones: any code in any cell."""
+    """Random ones: any code that the rules can produce in any cell."""
     rng = np.random.default_rng(seed)
     obs = np.zeros((number, OBS_SIZE), np.float32)
-    obs[:, :NUM_CELLS] = rng.integers(NUM_CODES, size=(number, NUM_CELLS))
+    obs[:, :NUM_CELLS] = rng.choice(POSSIBLE, size=(number, NUM_CELLS))
     obs[:, NUM_CELLS:][:, :NUM_COUNTS] = rng.integers(MAX_COUNT + 1, size=(number, NUM_COUNTS))
     obs[np.arange(number), NUM_CELLS + NUM_COUNTS + rng.integers(4, size=number)] = 1
     obs[:, LIGHT] = rng.random(number) if light is None else light
@@ -133,6 +135,17 @@ def test_codes_and_counts_are_rounded_into_their_range(layer):
     np.testing.assert_array_equal(encode(params, blurred), encode(params, obs))
     below, least = obs.at[:, :NUM_CELLS].set(-3.0), obs.at[:, :NUM_CELLS].set(0.0)
     np.testing.assert_array_equal(encode(params, below), encode(params, least))
+
+
+def test_a_code_that_cannot_be_shows_its_block(layer):
+    encode, params, _ = layer
+    obs = observations(NUM_CODES).at[:, :NUM_CELLS].set(jnp.arange(float(NUM_CODES))[:, None])
+    impossible = np.setdiff1d(np.arange(NUM_CODES), POSSIBLE)
+    blocks = obs.at[:, :NUM_CELLS].set(obs[:, :NUM_CELLS] % NUM_BLOCKS)
+    found, of_blocks = (np.asarray(encode(params, some)) for some in (obs, blocks))
+    np.testing.assert_array_equal(found[impossible], of_blocks[impossible])
+    seen = np.setdiff1d(POSSIBLE, np.arange(NUM_BLOCKS))
+    assert (np.abs(found - of_blocks)[seen].max(axis=1) > 1e-3).all()
 
 
 @pytest.mark.parametrize("tokens", [2, 1])

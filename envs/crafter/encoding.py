@@ -38,6 +38,8 @@ from envs.crafter.view import (
     NUM_CODES,
     NUM_COUNTS,
     NUM_FACINGS,
+    PLACE_AMONG_POSSIBLE,
+    POSSIBLE,
     ROWS,
 )
 
@@ -68,8 +70,11 @@ class Picture(nn.Module):
 
     @nn.compact
     def __call__(self, obs: Float[Array, "... 85"]) -> Float[Array, "..."]:
-        """Tokens ``[*batch, E]`` of observations; codes and counts are rounded and clipped to their
-        range."""
+        """Tokens ``[*batch, E]`` of observations.
+
+        Codes and counts are rounded and clipped to their range. Mobs and arrows are left out where the
+        rules do not let them be (``view.POSSIBLE``).
+        """
         shape = (PIXELS, PIXELS, 3, self.width)
         init = nn.initializers.lecun_normal(in_axis=(0, 1, 2), out_axis=3)
         kernel = self.param("kernel", init, shape)
@@ -123,22 +128,33 @@ def _with_cells(
     who = jnp.where(asleep > 0, NUM_FACINGS, facing)
     player = who * NUM_BLOCKS + codes[..., MIDDLE] % NUM_BLOCKS
     # The tables depend only on the weights, so they are computed outside of loops, once per episode.
-    of_cells = tables("day", kernels[:, others])
+    of_cells = tables("day", kernels[:, others], POSSIBLE)
     of_player = tables("player", kernels[:, MIDDLE : MIDDLE + 1])
     add = _with_looked_up if jax.default_backend() == "cpu" else _with_multiplied
-    token = add(token, of_cells, Shown(codes[..., others], light, asleep))
+    rows = jnp.asarray(PLACE_AMONG_POSSIBLE)[codes[..., others]]
+    token = add(token, of_cells, Shown(rows, light, asleep))
     return add(token, of_player, Shown(player[..., None], light, asleep))
 
 
-def tables(kind: str, kernels: Float[Array, "2 cells TILE E"]) -> Float[Array, "cells 2 2 rows E"]:
-    """The products of the weights of some cells with all tiles of a kind.
+def tables(
+    kind: str,
+    kernels: Float[Array, "2 cells TILE E"],
+    which: Int[np.ndarray, "rows"] | None = None,
+) -> Float[Array, "cells 2 2 rows E"]:
+    """The products of the weights of some cells with tiles of a kind.
+
+    Args:
+      kind: a field of ``Tiles``.
+      kernels: the weights for an agent that is awake, and for one that sleeps.
+      which: the indices of the tiles; None for all.
 
     Returns:
       ``[cells, 2, 2, rows, E]``: for each cell, awake or asleep, by day or at night, and each tile.
     """
     shown = np.stack([getattr(tiles(UNIT), kind), getattr(night_tiles(UNIT), kind)]) / LEVELS
-    flat = jnp.asarray(shown.reshape(2, -1, TILE), jnp.float32)
-    return jnp.einsum("lrt,scte->cslre", flat, kernels)
+    flat = shown.reshape(2, -1, TILE)
+    chosen = flat if which is None else flat[:, which]
+    return jnp.einsum("lrt,scte->cslre", jnp.asarray(chosen, jnp.float32), kernels)
 
 
 def _with_looked_up(

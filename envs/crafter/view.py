@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from craftax.craftax_classic.constants import Achievement, Action, BlockType
 from craftax.craftax_classic.envs.craftax_state import EnvState, Mobs
 from jaxtyping import Array, Float, Int
@@ -41,6 +42,30 @@ LAYOUT = ObsLayout(
     num_counts=NUM_COUNTS,
     max_count=MAX_COUNT,
 )
+
+WALKED = ("grass", "sand", "path")  # blocks on which mobs can be
+FLOWN_OVER = (*WALKED, "water", "lava")  # blocks on which arrows can be
+PLACED = ("stone", "crafting_table", "furnace", "plant")  # blocks that can be placed under an arrow
+
+
+def _possible_codes() -> list[int]:
+    """The codes that the rules can produce, and those of all blocks alone."""
+    walked, flown_over = (
+        [BLOCKS.index(name) for name in names] for names in (WALKED, (*FLOWN_OVER, *PLACED))
+    )
+    with_mobs = [b + NUM_BLOCKS * mob for mob in range(1, NUM_MOBS) for b in walked]
+    step = NUM_BLOCKS * NUM_MOBS
+    below_arrows = [*flown_over, *with_mobs]
+    with_arrows = [code + step * arrow for arrow in range(1, NUM_ARROWS) for code in below_arrows]
+    return [*range(NUM_BLOCKS), *with_mobs, *with_arrows]
+
+
+POSSIBLE = np.array(_possible_codes())
+"""The codes that the rules can produce, and those of all blocks alone, less than a third of all codes."""
+
+PLACE_AMONG_POSSIBLE = np.arange(NUM_CODES) % NUM_BLOCKS
+"""For each code its index in ``POSSIBLE``; a code that the rules cannot produce has that of its block."""
+PLACE_AMONG_POSSIBLE[POSSIBLE] = np.arange(len(POSSIBLE))
 
 
 def observe(world: EnvState) -> Float[Array, "O"]:
