@@ -39,6 +39,10 @@ OTHER_SETTINGS = {  # of published results that the paper's number may not stand
     "ablations/maze15/behind-noise/plan-obs": "obs_noise=0.02",
     "ablations/maze15/behind-noise/ucb-action": "action_noise=0.1",
     "ablations/maze15/behind-noise/ucb-obs": "obs_noise=0.02",
+    **{
+        f"ablations/maze15/paper-recipe/{m}": "policy=results/ablations/maze15/paper-recipe/policy"
+        for m in ("ucb", "bpe", "explore", "grips", "bbt")
+    },
 }
 KITCHEN = RESULTS / "ablations" / "kitchen" / "mixture" / "ucb"  # of the first format
 
