@@ -25,7 +25,8 @@ from tqdm import tqdm
 
 import mgpo_jax as mgpo
 from envs.crafter.env import NUM_ACHIEVEMENTS, PLACE_UNIT, Achievement
-from experiments.store.results import Results, load_results
+from experiments.store.result_files import load_results
+from experiments.store.results import Results
 from experiments.store.statistics import gain_over_tasks
 
 RARE = (Achievement.COLLECT_COAL, Achievement.COLLECT_IRON, Achievement.COLLECT_DIAMOND)

@@ -22,7 +22,7 @@ from experiments.store import runs
 from experiments.store.paper import paper_value
 from experiments.store.policies import check_weights
 from experiments.store.provenance import provenance
-from experiments.store.results import load_results
+from experiments.store.result_files import load_results
 from experiments.store.seals import write_sealed
 from experiments.store.settings import (
     AdaptConfig,

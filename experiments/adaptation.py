@@ -19,7 +19,8 @@ from experiments.runtime import expect_compiling
 from experiments.store.layout import META
 from experiments.store.policies import check_weights, far_prompts
 from experiments.store.provenance import provenance
-from experiments.store.results import Results, load_results, results_of, write_results
+from experiments.store.result_files import load_results, write_results
+from experiments.store.results import Results, results_of
 from experiments.store.runs import changes
 from experiments.store.settings import AdaptConfig
 from experiments.store.summary import ADAPT_AGAIN, judged_episodes, summarize

@@ -48,7 +48,7 @@ def main(config: CompareConfig) -> None:
     if config.env is not None:
         envs.find(config.env)  # imports the module, so that the results may name it
     from experiments.pairing import as_csv, as_table, differing
-    from experiments.store.results import load_results
+    from experiments.store.result_files import load_results
 
     results = [load_results(folder, parts=()) for folder in config.runs]
     text = as_table(config.runs, results)

@@ -27,7 +27,8 @@ from experiments.runtime import say
 from experiments.signals import GO_ON
 from experiments.store import runs
 from experiments.store.paper import paper_final, paper_worlds
-from experiments.store.results import Results, load_results
+from experiments.store.result_files import load_results
+from experiments.store.results import Results
 from experiments.store.rows import PAPER_EPISODES, read_row
 from experiments.store.seals import check_replaceable, write_sealed
 from experiments.store.settings import AdaptConfig, ReproduceConfig, file_name, pretrain_preset

@@ -18,7 +18,8 @@ from envs.registry import WORLDS, World
 from envs.wrappers import Noisy
 from experiments.store.layout import TASKS
 from experiments.store.policies import load_policy_of
-from experiments.store.results import Results, load_results
+from experiments.store.result_files import load_results
+from experiments.store.results import Results
 from experiments.store.statistics import SeedSpread, mean_log_success, seed_spread
 from experiments.store.tables import table
 from mgpo_jax import processes

@@ -41,7 +41,7 @@ def main(config: PlotConfig) -> None:
     if config.env is not None:
         envs.find(config.env)  # imports the module, so that the results may name it
     from experiments.drawing import by_world, check_together, labeled, pictures_together, write
-    from experiments.store.results import load_results
+    from experiments.store.result_files import load_results
     from experiments.store.seals import check_replaceable
 
     groups = list(by_world(config.runs, load_results))

@@ -16,7 +16,7 @@ from envs.registry import World
 from experiments.adaptation import adapt_all, deciding, results_with_summary
 from experiments.runtime import say
 from experiments.store.provenance import provenance
-from experiments.store.results import write_results
+from experiments.store.result_files import write_results
 from experiments.store.settings import AdaptConfig
 from experiments.store.work import long_work
 from mgpo_jax import methods, processes
@@ -81,7 +81,7 @@ def show(config: AdaptConfig, folders: Sequence[Path]) -> None:
     """Print a table of the variants, and draw their learning curves in one figure."""
     from experiments.drawing import write
     from experiments.figures import later, learning_curve
-    from experiments.store.results import load_results
+    from experiments.store.result_files import load_results
     from experiments.store.rows import as_json, comparison, read_row
 
     rows = [read_row(folder) for folder in folders]

@@ -20,7 +20,7 @@ from envs.wrappers import Noisy
 from experiments.check import CheckConfig
 from experiments.check import main as check
 from experiments.evaluation import Noise, cells, evaluate_cases, noises, open_case
-from experiments.store.results import save_results
+from experiments.store.result_files import save_results
 from mgpo_jax.files import hash_file
 
 WIDTHS = (0.5, 0.25, 0.0, 0.0, 0.0, 0.0)

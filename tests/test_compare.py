@@ -12,7 +12,7 @@ import pytest
 from envs.errors import UsageError
 from experiments.compare import CompareConfig, main
 from experiments.figures import performance_profiles
-from experiments.store.results import load_results
+from experiments.store.result_files import load_results
 from experiments.store.statistics import performance_profile
 
 RESULTS = Path(__file__).parent.parent / "results"

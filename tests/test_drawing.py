@@ -23,7 +23,8 @@ from envs.registry import WORLDS, World
 from experiments import drawing, evaluation
 from experiments.plot import PlotConfig, main
 from experiments.store.policies import check_weights
-from experiments.store.results import Results, save_results
+from experiments.store.result_files import save_results
+from experiments.store.results import Results
 from experiments.store.summary import summarize
 from mgpo_jax.policy_files import read_policy, save_policy
 from mgpo_jax.prompts import prompt_of, single_goal

@@ -19,7 +19,7 @@ from own_world import Line
 
 import mgpo_jax
 from experiments import runtime
-from experiments.store.results import load_results
+from experiments.store.result_files import load_results
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.prompts import single_goal
 from mgpo_jax.tasks import sample_tasks

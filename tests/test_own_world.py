@@ -20,7 +20,7 @@ from own_world import CELLS, Doors, Line
 
 from envs.episodes import replay
 from experiments import runtime
-from experiments.store.results import load_results
+from experiments.store.result_files import load_results
 from mgpo_jax import methods
 from mgpo_jax.kinds import MULTI_GOAL
 from mgpo_jax.tasks import task_at

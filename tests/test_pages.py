@@ -33,7 +33,8 @@ from experiments.playground import PlaygroundConfig
 from experiments.playground import main as playground_main
 from experiments.report import ReportConfig
 from experiments.report import main as report_main
-from experiments.store.results import Results, load_results, save_results
+from experiments.store.result_files import load_results, save_results
+from experiments.store.results import Results
 from experiments.store.rows import read_row
 from experiments.store.seals import is_sealed
 from experiments.store.summary import summarize

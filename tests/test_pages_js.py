@@ -21,7 +21,7 @@ from experiments.pages.packing import unpacked
 from experiments.pages.playground import world_data
 from experiments.pages.report import report_data
 from experiments.pages.worlds import page_of
-from experiments.store.results import load_results
+from experiments.store.result_files import load_results
 from experiments.store.rows import read_row
 from mgpo_jax.policy_files import load_policy
 

@@ -22,7 +22,8 @@ from envs.wrappers import Wrapper
 from experiments.pages.build import SCRIPTS, Bundle, as_text
 from experiments.pages.packing import packed
 from experiments.pages.plans import plan_of
-from experiments.store.results import Results, load_results
+from experiments.store.result_files import load_results
+from experiments.store.results import Results
 from mgpo_jax.outcomes import Reached
 
 ROOT = Path(__file__).parents[1]

@@ -17,7 +17,7 @@ import experiments.pages.tracks as tracks
 from envs.page import Page
 from experiments.pages.build import Bundle
 from experiments.pages.tracks import tracks_of
-from experiments.store.results import load_results
+from experiments.store.result_files import load_results
 
 ROOT = Path(__file__).parents[1]
 NORTH, EAST, STAY = 1, 2, 4

@@ -12,7 +12,8 @@ import pytest
 
 from experiments import prompt_lengths
 from experiments.prompt_lengths import Length, as_table, best_goals, by_length, draw_prompts
-from experiments.store.results import Results, load_results
+from experiments.store.result_files import load_results
+from experiments.store.results import Results
 from experiments.store.statistics import SeedSpread
 from mgpo_jax.judging import Uncertainty
 

@@ -12,7 +12,7 @@ import pytest
 
 import envs
 from envs.episodes import replay
-from experiments.store.results import load_results
+from experiments.store.result_files import load_results
 
 RESULTS = Path(__file__).parent.parent / "results"
 NUM_REPLAYED = 200

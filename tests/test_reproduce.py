@@ -19,7 +19,7 @@ from experiments import ablations, comparisons, inventory, reproduce, robustness
 from experiments.reproduce import main
 from experiments.store import settings as store_settings
 from experiments.store.paper import paper_worlds
-from experiments.store.results import load_results
+from experiments.store.result_files import load_results
 from experiments.store.settings import PretrainConfig, ReproduceConfig, pretrain_preset
 from experiments.store.summary import read_summary
 from mgpo_jax import methods

@@ -24,7 +24,8 @@ from envs.registry import WORLDS, Judgement, World
 from envs.wrappers import behind_noise
 from experiments.store.metrics import read_metrics
 from experiments.store.policies import load_policy_of
-from experiments.store.results import PARTS, Results, load_results, results_of, save_results
+from experiments.store.result_files import PARTS, load_results, save_results
+from experiments.store.results import Results, results_of
 from experiments.store.summary import printed, read_summary, summarize
 from mgpo_jax.kinds import MULTI_GOAL
 from mgpo_jax.methods import BbtHyper, policy_kind

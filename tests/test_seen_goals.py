@@ -27,7 +27,7 @@ from experiments.pages.packing import unpacked
 from experiments.pages.playground import world_data
 from experiments.pages.report import report_data
 from experiments.store.policies import far_prompts, seen_goals_of
-from experiments.store.results import load_results
+from experiments.store.result_files import load_results
 from experiments.store.rows import read_row
 from mgpo_jax import tasks as tasks_of
 from mgpo_jax.dataset import Dataset

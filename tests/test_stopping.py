@@ -10,7 +10,8 @@ import pytest
 from test_runner import MAZE, Point, tasks_of, untrained
 
 from envs.registry import WORLDS, Judgement, World
-from experiments.store.results import load_results, results_of, save_results
+from experiments.store.result_files import load_results, save_results
+from experiments.store.results import results_of
 from experiments.store.summary import printed, summarize
 from mgpo_jax.journal import Journal
 from mgpo_jax.methods import UCB

@@ -14,7 +14,7 @@ from envs.errors import UsageError
 from envs.registry import WORLDS
 from experiments import adapt
 from experiments.parsing import parse
-from experiments.store.results import load_results
+from experiments.store.result_files import load_results
 from experiments.store.settings import AdaptConfig
 from experiments.sweeping import variants
 from mgpo_jax import runner

@@ -18,7 +18,8 @@ import envs.kitchen
 from envs.errors import DataError, MissingExtraError, UsageError
 from envs.registry import WORLDS
 from experiments.store.paper import paper_final
-from experiments.store.results import Results, load_results, save_results
+from experiments.store.result_files import load_results, save_results
+from experiments.store.results import Results
 from experiments.store.rows import HEAD, STATED, Row, comparison, read_row
 from experiments.store.seals import check_replaceable, is_sealed, sealed, write_sealed
 from experiments.store.summary import printed, read_summary, solvable_tasks, summarize

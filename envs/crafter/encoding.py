@@ -139,7 +139,7 @@ def _with_cells(
 def tables(
     kind: str,
     kernels: Float[Array, "2 cells TILE E"],
-    which: Int[np.ndarray, "rows"] | None = None,
+    which: Int[np.ndarray, "R"] | None = None,
 ) -> Float[Array, "cells 2 2 rows E"]:
     """The products of the weights of some cells with tiles of a kind.
 

@@ -28,7 +28,8 @@ from experiments.store.layout import META
 from experiments.store.paper import paper_final
 from experiments.store.policies import far_prompts, seen_goals_of
 from experiments.store.provenance import read_meta
-from experiments.store.results import Results, load_results
+from experiments.store.result_files import load_results
+from experiments.store.results import Results
 from experiments.store.rows import Row, read_row
 from experiments.store.seals import write_sealed
 from experiments.store.statistics import Interval, PartShare, SeedSpread, compare, same_tasks

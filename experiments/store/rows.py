@@ -123,7 +123,7 @@ def _shares_of_older(folder: Path, summary: Summary) -> list[tuple[float, int]] 
     """
     if not (0 <= summary["initial_return"] <= 1 and 0 <= summary["final_return"] <= 1):
         return None
-    from experiments.store.results import load_results
+    from experiments.store.result_files import load_results
 
     results = load_results(folder, parts=())
     with suppress(ImportError):
