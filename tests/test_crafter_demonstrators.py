@@ -15,7 +15,7 @@ pytest.importorskip("craftax")
 from craftax.craftax_classic.constants import Achievement, Action, BlockType
 
 import envs
-from envs.crafter import planning, searching
+from envs.crafter import planning, scenes, searching
 from envs.crafter.demonstrators import (
     HABITS,
     NUM_RANDOM,
@@ -25,7 +25,7 @@ from envs.crafter.demonstrators import (
     planner,
 )
 from envs.crafter.env import Crafter, CrafterTask
-from envs.crafter.planning import Habits
+from envs.crafter.habits import TIERS, Habits, Plan, make_plan
 from envs.crafter.searching import DIG, LONGEST, MOVES, SIDE, WADE, Aims, Terrain
 from envs.episodes import run_episode
 from envs.errors import UsageError
@@ -210,15 +210,13 @@ def with_mob(state, kind, cell):
 def plan_of(*achievements):
     """To strive for these alone, in this order."""
     order = [achievements.index(a) if a in achievements else 50 for a in Achievement]
-    return planning.Plan(
-        places=jnp.array(order, jnp.float32), wanted=jnp.array([o < 50 for o in order])
-    )
+    return Plan(places=jnp.array(order, jnp.float32), wanted=jnp.array([o < 50 for o in order]))
 
 
 def memory_of(plan, noise=0.0):
     """What an agent remembers before its first step."""
     nothing = jnp.zeros((), jnp.int32)
-    return Memory(planning.unknown_map(), plan, jnp.asarray(noise), left=nothing, intended=nothing)
+    return Memory(scenes.unknown_map(), plan, jnp.asarray(noise), left=nothing, intended=nothing)
 
 
 @cache
@@ -387,7 +385,7 @@ class TestNight:
     def test_nothing_can_walk_to_it(self):
         names, states = self.night()
         world = states[names.index("SLEEP")].world
-        walkable = np.isin(world.map, [kind.value for kind in planning.WALKABLE])
+        walkable = np.isin(world.map, [kind.value for kind in scenes.WALKABLE])
         room = {tuple(map(int, world.player_position))}
         for _ in range(SIDE):
             room |= {
@@ -449,10 +447,10 @@ def cases():
 @jax.vmap
 def remembered(world, visited):
     """The known blocks of an agent that was at these places, and which cells it has seen."""
-    blocks, seen = planning.unknown_map(), searching.nowhere()
+    blocks, seen = scenes.unknown_map(), searching.nowhere()
     for place in visited:
-        blocks = planning.look(blocks, world.replace(player_position=place))
-        seen = searching.union(seen, searching.rectangle(place, *planning.HALF_VIEW))
+        blocks = scenes.look(blocks, world.replace(player_position=place))
+        seen = searching.union(seen, searching.rectangle(place, *scenes.HALF_VIEW))
     return blocks, searching.unpack(seen)
 
 
@@ -460,8 +458,8 @@ def remembered(world, visited):
 @jax.vmap
 def chosen(key, blocks, world, place):
     """The action at a place with these blocks known."""
-    scene = planning.scene_of(blocks, world.replace(player_position=place))
-    return planning.act(key, scene, planning.make_plan(key, Habits()), Habits())
+    scene = scenes.scene_of(blocks, world.replace(player_position=place))
+    return planning.act(key, scene, make_plan(key, Habits()), Habits())
 
 
 @jax.jit
@@ -506,7 +504,7 @@ class TestSight:
     def test_a_map_of_the_whole_world_is_used(self):
         worlds, visited = cases()
         keys = jax.random.split(jax.random.key(3), NUM_CASES)
-        whole = jax.jit(jax.vmap(planning.whole_map))(worlds)
+        whole = jax.jit(jax.vmap(scenes.whole_map))(worlds)
         blocks, _ = remembered(worlds, visited)
         known = np.asarray(chosen(keys, whole, worlds, visited[:, -1]))
         assert np.mean(known != np.asarray(chosen(keys, blocks, worlds, visited[:, -1]))) > 0.03
@@ -530,9 +528,7 @@ class TestSight:
 
     def test_sees_nine_columns_and_seven_rows(self):
         state = made("@")
-        seen = searching.unpack(
-            searching.union(*planning.look(planning.unknown_map(), state.world))
-        )
+        seen = searching.unpack(searching.union(*scenes.look(scenes.unknown_map(), state.world)))
         rows, columns = np.nonzero(seen)
         assert (rows.min(), rows.max()) == (29, 35)
         assert (columns.min(), columns.max()) == (28, 36)
@@ -542,10 +538,10 @@ class TestSight:
         """What is out of view stays as it was; what is in view is as it is."""
         state = made("T...@...T")
         world = state.world
-        blocks = planning.look(planning.unknown_map(), world)
+        blocks = scenes.look(scenes.unknown_map(), world)
         gone = world.map.at[32, 28].set(BlockType.SAND.value).at[32, 36].set(BlockType.SAND.value)
         moved = world.replace(map=gone, player_position=jnp.array([32, 33]))
-        trees = planning.look(blocks, moved)[BlockType.TREE.value]
+        trees = scenes.look(blocks, moved)[BlockType.TREE.value]
         assert np.argwhere(np.asarray(searching.unpack(trees))).tolist() == [[32, 28]]
 
 
@@ -553,7 +549,7 @@ class TestNoise:
     def run(self, habits, num_steps=4000):
         """Executed actions of an agent that always intends to make an iron sword."""
         state = made("~L~\n.@.\n...\n")
-        scene = planning.scene_of(planning.look(planning.unknown_map(), state.world), state.world)
+        scene = scenes.scene_of(scenes.look(scenes.unknown_map(), state.world), state.world)
         agent = planner(habits)
         intended = jnp.asarray(Action.MAKE_IRON_SWORD.value, jnp.int32)
         memory = memory_of(plan_of(), habits.noise)._replace(intended=intended)
@@ -591,14 +587,14 @@ class TestPlans:
     def test_orders_and_omissions_vary(self):
         keys = jax.random.split(jax.random.key(0), 500)
         habits = Habits(drop=0.2, shuffle=2.0)
-        plans = jax.jit(jax.vmap(lambda key: planning.make_plan(key, habits)))(keys)
+        plans = jax.jit(jax.vmap(lambda key: make_plan(key, habits)))(keys)
         assert abs(1 - np.mean(plans.wanted) - 0.2) < 0.02
-        tiers = np.array([planning.TIERS[achievement] for achievement in Achievement])
+        tiers = np.array([TIERS[achievement] for achievement in Achievement])
         assert np.abs(np.mean(plans.places, axis=0) - tiers).max() < 0.4
         assert len({tuple(order) for order in np.argsort(plans.places, axis=1).tolist()}) > 490
 
     def test_every_achievement_has_a_tier(self):
-        assert set(planning.TIERS) == set(Achievement)
+        assert set(TIERS) == set(Achievement)
 
 
 class TestDemonstrators:

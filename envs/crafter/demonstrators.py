@@ -20,17 +20,9 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 
 from envs.base import Agent, Demonstrator, TimeStep
 from envs.crafter.env import Crafter, CrafterState, CrafterTask
-from envs.crafter.planning import (
-    Habits,
-    Plan,
-    Scene,
-    act,
-    look,
-    make_plan,
-    scene_of,
-    unknown_map,
-    whole_map,
-)
+from envs.crafter.habits import Habits, Plan, make_plan
+from envs.crafter.planning import act
+from envs.crafter.scenes import Scene, look, scene_of, unknown_map, whole_map
 from envs.crafter.searching import MOVES, contains
 
 NUM_RANDOM = Action.DO.value + 1  # random actions wait, move or act, but never place or make

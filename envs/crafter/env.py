@@ -27,7 +27,7 @@ from craftax.craftax_classic.envs.craftax_state import EnvState
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 
 from envs.base import ArraySpec, Discrete, Environment, EnvSpec, TimeStep
-from envs.crafter.planning import TIERS
+from envs.crafter.habits import TIERS
 from envs.crafter.rules import SIDE, advance, new_world
 from envs.crafter.tiles import PIXELS, agent_picture
 from envs.crafter.view import (
