@@ -143,12 +143,15 @@ class Encoder:
         categorical, such observations are not standardized and get no noise.
       fault: ``(layout, shape) -> text``, what is wrong with observations of this layout and shape, as the
         end of a sentence about the layout; None if nothing is.
+      prepare: ``(parameters of the module) -> parameters`` with which the module makes the same tokens with
+        less work, computed once before an agent acts step by step; None if there is nothing to prepare.
     """
 
     name: str
     make: Callable[[tuple[int, ...], int, ObsLayout | None], Any]
     uses_layout: bool = False
     fault: Callable[[ObsLayout, tuple[int, ...]], str | None] = lambda layout, shape: None
+    prepare: Callable[[Any], Any] | None = None
 
 
 Record = TypeVar("Record")

@@ -57,7 +57,8 @@ class Actor:
         self._key = jax.random.key(seed)
         self._greedy = jnp.asarray(greedy)
         self._prefill, self._decode = (
-            partial(function, policy.params) for function in _compiled(policy.config)
+            partial(function, policy.config.prepared(policy.params))
+            for function in _compiled(policy.config)
         )
         self._step = 0
         self.prompt = goals

@@ -82,12 +82,13 @@ def check_fits(config: NetworkConfig, spec: EnvSpec, who: str = "the policy") ->
 def transformer_policy(config: TransformerConfig, params: Any) -> Policy:
     """The pre-trained multi-goal Transformer as a policy; the carry is its KV cache."""
     network = GoalTransformer(config)
+    acting = config.prepared(params)
 
     def prefill(prompt: Any, obs: Any) -> Any:
-        return network.apply(params, prompt, obs, method="prefill")
+        return network.apply(acting, prompt, obs, method="prefill")
 
     def decode(carry: Any, action: Any, obs: Any) -> Any:
-        return network.apply(params, carry, action, obs, method="decode")
+        return network.apply(acting, carry, action, obs, method="decode")
 
     def grow(cache: Any, num_steps: int) -> Any:
         return grow_cache(cache, config.tokens_per_step * num_steps)

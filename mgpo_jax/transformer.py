@@ -85,6 +85,13 @@ class NetworkConfig:
         module: nn.Module = make(self.obs_shape, width, self.obs_layout)
         return module
 
+    def prepared(self, params: Any) -> Any:
+        """Parameters with which the network acts as with ``params``, and its encoder with less work."""
+        prepare, parts = ENCODERS.find(self.encoder).prepare, params["params"]
+        if prepare is None:
+            return params
+        return {**params, "params": {**parts, "embed_obs": prepare(parts["embed_obs"])}}
+
     def action_numbers(self, actions: Array) -> Float[Array, "... A"]:
         """Actions as input features: one-hot if they are discrete, unchanged if continuous."""
         discrete = self.head == "categorical"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +14,7 @@ from envs.base import ObsLayout
 from envs.errors import UsageError
 
 pytest.importorskip("craftax")
-from envs.crafter.encoding import Picture
+from envs.crafter.encoding import TILE, Picture
 from envs.crafter.tiles import agent_picture
 from envs.crafter.view import (
     ASLEEP,
@@ -26,8 +28,8 @@ from envs.crafter.view import (
     OBS_SIZE,
     POSSIBLE,
 )
-from mgpo_jax.policy import LoadedPolicy
-from mgpo_jax.prompts import Prompt
+from mgpo_jax.policy import LoadedPolicy, transformer_policy
+from mgpo_jax.prompts import Prompt, single_goal
 from mgpo_jax.settings import ENCODERS
 from mgpo_jax.transformer import GoalTransformer, network_config
 
@@ -111,6 +113,35 @@ def test_any_number_of_leading_axes(layer):
         encode(params, obs.reshape(2, 3, -1)).reshape(6, -1), flat, rtol=1e-5
     )
     np.testing.assert_allclose(encode(params, obs[0]), flat[0], rtol=1e-4, atol=1e-5)
+
+
+def test_prepared_parameters_make_the_same_tokens(layer):
+    encode, params, _ = layer
+    ready = {"params": ENCODERS.find("crafter-picture").prepare(params["params"])}
+    assert "kernel" not in ready["params"]
+    again = ENCODERS.find("crafter-picture").prepare(ready["params"])
+    assert all(again[name] is ready["params"][name] for name in again)
+    obs = observations(asleep=1.0)
+    np.testing.assert_allclose(encode(ready, obs), encode(params, obs), rtol=1e-5, atol=1e-5)
+
+
+def test_an_acting_agent_only_looks_up():
+    """The products of weights and tiles belong to the policy, not to each of its steps."""
+    spec = envs.make("crafter").spec
+    config = network_config(spec, encoder="crafter-picture", embed_dim=8, num_heads=1)
+    network, obs = GoalTransformer(config), jnp.zeros(OBS_SIZE)
+    prompt = single_goal(jnp.ones(config.goal_dim), config.max_prompt_length)
+    params = network.init(jax.random.key(0), prompt, obs[None], jnp.zeros(1, jnp.int32))
+    policy = transformer_policy(config, params)
+    carry = policy.grow(policy.prefill(prompt, obs)[1], 1)
+
+    def decode(acting):
+        step = partial(network.apply, acting, carry, jnp.int32(0), method="decode")
+        return str(jax.make_jaxpr(lambda obs: step(obs)[0].logits)(obs))
+
+    acts = str(jax.make_jaxpr(lambda obs: policy.decode(carry, jnp.int32(0), obs)[0].logits)(obs))
+    assert f",{TILE}" in decode(params)
+    assert f",{TILE}" not in acts
 
 
 def test_other_observations_are_refused():

@@ -11,6 +11,7 @@ from envs.registry import Encoder, Judgement, World
 
 if TYPE_CHECKING:
     from flax.linen import Module
+    from jaxtyping import Array
 
     from envs.base import Demonstrator, ObsLayout
     from envs.crafter.env import Crafter
@@ -90,7 +91,20 @@ def encoder_fault(layout: ObsLayout, shape: tuple[int, ...]) -> str | None:
     return None
 
 
-PICTURE = Encoder(name="crafter-picture", make=make_encoder, uses_layout=True, fault=encoder_fault)
+def prepare_encoder(params: Mapping[str, Array]) -> dict[str, Array]:
+    """The parameters of ``make_encoder``'s module, multiplied with all tiles that it may be shown."""
+    from envs.crafter.encoding import prepared
+
+    return prepared(params)
+
+
+PICTURE = Encoder(
+    name="crafter-picture",
+    make=make_encoder,
+    uses_layout=True,
+    fault=encoder_fault,
+    prepare=prepare_encoder,
+)
 
 PRESETS = {
     # Prompts have room for one goal per achievement, and the task goal.

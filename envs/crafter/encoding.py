@@ -9,6 +9,7 @@ half of 255 levels.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import flax.linen as nn
@@ -75,17 +76,63 @@ class Picture(nn.Module):
         Codes and counts are rounded and clipped to their range. Mobs and arrows are left out where the
         rules do not let them be (``view.POSSIBLE``).
         """
+        if self.has_variable("params", "cells"):
+            made = Tables(*(self.get_variable("params", name) for name in Tables._fields))
+            return _token(made, obs)
         shape = (PIXELS, PIXELS, 3, self.width)
         init = nn.initializers.lecun_normal(in_axis=(0, 1, 2), out_axis=3)
         kernel = self.param("kernel", init, shape)
         bias = self.param("bias", nn.initializers.zeros_init(), (self.width,))
-        places = by_place(kernel)
-        view, items = places[:NUM_CELLS], places[NUM_CELLS:]
-        asleep = obs[..., ASLEEP, None] > 0.5
-        token = bias + jnp.where(asleep, _sleep_offset(view), 0.0)
-        kernels = jnp.stack([view, gray_kernel(view)])
-        token = _with_cells(token, kernels, obs)
-        return _with_items(token, items, obs)
+        return _token(tables_of(kernel, bias), obs)
+
+
+class Tables(NamedTuple):
+    """What the encoder computes from its weights alone."""
+
+    cells: Float[Array, "62 2 2 R E"]
+    """The products of the weights of all cells but the agent's with the tiles of ``POSSIBLE``."""
+    player: Float[Array, "1 2 2 R E"]
+    """The products for the cell of the agent with the tiles on which it stands."""
+    items: Float[Array, "16 10 E"]
+    """The products for the icons of the items with every count, in the order of ``ITEMS``."""
+    bias: Float[Array, "E"]
+    sleep: Float[Array, "E"]
+    """The constant that the tint of sleep adds."""
+
+
+def tables_of(kernel: Float[Array, "64 64 3 E"], bias: Float[Array, "E"]) -> Tables:
+    """The tables that belong to the weights of the linear layer on the picture."""
+    places = by_place(kernel)
+    view, below = places[:NUM_CELLS], places[NUM_CELLS : NUM_CELLS + NUM_COUNTS]
+    kernels = jnp.stack([view, gray_kernel(view)])
+    others = np.delete(np.arange(NUM_CELLS), MIDDLE)
+    icons = tiles(UNIT).items.reshape(NUM_COUNTS, -1, TILE) / LEVELS
+    in_order = jnp.asarray(icons[[COUNTS.index(name) for name in ITEMS]], jnp.float32)
+    return Tables(
+        cells=tables("day", kernels[:, others], POSSIBLE),
+        player=tables("player", kernels[:, MIDDLE : MIDDLE + 1]),
+        items=jnp.einsum("pct,pte->pce", in_order, below),
+        bias=bias,
+        sleep=_sleep_offset(view),
+    )
+
+
+def prepared(params: Mapping[str, Array]) -> dict[str, Array]:
+    """The tables in the place of the encoder's parameters, so that an acting agent looks up only.
+
+    A compiler does not move such large tables out of the loop over the steps of an episode by itself.
+    Parameters that were prepared before stay as they are.
+    """
+    if "kernel" not in params:
+        return dict(params)
+    return tables_of(params["kernel"], params["bias"])._asdict()
+
+
+def _token(made: Tables, obs: Float[Array, "*batch 85"]) -> Float[Array, "*batch E"]:
+    """Tokens of observations by looking up in the tables."""
+    asleep = obs[..., ASLEEP, None] > 0.5
+    token = made.bias + jnp.where(asleep, made.sleep, 0.0)
+    return _with_items(_with_cells(token, made, obs), made.items, obs)
 
 
 def by_place(kernel: Float[Array, "64 64 3 E"]) -> Float[Array, "places TILE E"]:
@@ -110,11 +157,9 @@ def _sleep_offset(places: Float[Array, "places TILE E"]) -> Float[Array, "E"]:
 
 
 def _with_cells(
-    token: Float[Array, "*batch E"],
-    kernels: Float[Array, "2 63 TILE E"],
-    obs: Float[Array, "*batch 85"],
+    token: Float[Array, "*batch E"], made: Tables, obs: Float[Array, "*batch 85"]
 ) -> Float[Array, "*batch E"]:
-    """The token plus the contributions of the cells in view, with weights for being awake and asleep.
+    """The token plus the contributions of the cells in view.
 
     On a CPU these are added cell by cell, since those of all cells at once would fill the memory.
     Accelerators are slow at scattering the gradient over the tables and fast at products, so they use a
@@ -127,13 +172,10 @@ def _with_cells(
     facing = jnp.argmax(obs[..., NUM_CELLS + NUM_COUNTS :][..., :NUM_FACINGS], axis=-1)
     who = jnp.where(asleep > 0, NUM_FACINGS, facing)
     player = who * NUM_BLOCKS + codes[..., MIDDLE] % NUM_BLOCKS
-    # The tables depend only on the weights, so they are computed outside of loops, once per episode.
-    of_cells = tables("day", kernels[:, others], POSSIBLE)
-    of_player = tables("player", kernels[:, MIDDLE : MIDDLE + 1])
     add = _with_looked_up if jax.default_backend() == "cpu" else _with_multiplied
     rows = jnp.asarray(PLACE_AMONG_POSSIBLE)[codes[..., others]]
-    token = add(token, of_cells, Shown(rows, light, asleep))
-    return add(token, of_player, Shown(player[..., None], light, asleep))
+    token = add(token, made.cells, Shown(rows, light, asleep))
+    return add(token, made.player, Shown(player[..., None], light, asleep))
 
 
 def tables(
@@ -183,16 +225,14 @@ def _with_multiplied(
 
 def _with_items(
     token: Float[Array, "*batch E"],
-    places: Float[Array, "places TILE E"],
+    items: Float[Array, "16 10 E"],
     obs: Float[Array, "*batch 85"],
 ) -> Float[Array, "*batch E"]:
     """The token plus the contributions of the items' icons, which do not depend on night or sleep."""
-    shown = tiles(UNIT).items.reshape(NUM_COUNTS, -1, TILE) / LEVELS
     counts = jnp.round(obs[..., NUM_CELLS : NUM_CELLS + NUM_COUNTS]).astype(jnp.int32)
     for place, name in enumerate(ITEMS):
-        index = COUNTS.index(name)
-        table = jnp.asarray(shown[index], jnp.float32) @ places[place]
-        shown_count = jnp.clip(counts[..., index], 0, MAX_COUNT)
+        table = items[place]
+        shown_count = jnp.clip(counts[..., COUNTS.index(name)], 0, MAX_COUNT)
         if jax.default_backend() == "cpu":
             token = token + table[shown_count]
         else:  # as in ``_with_cells``

@@ -238,6 +238,7 @@ def low_level(config: CommandConfig, params: Any, judged: Judgement) -> LowLevel
       judged: how actions are chosen. Training episodes use the same way as judging ones.
     """
     network: Any = CommandedTransformer(config)
+    params = config.prepared(params)
     temperature = jnp.float32(judged.temperature) if judged.tempered else None
 
     def view(obs: Array, features: Array) -> View:

@@ -228,6 +228,7 @@ def low_level(config: SkillConfig, params: Any, judged: Judgement) -> LowLevel:
       judged: how actions are chosen. Training episodes use the same way as judging ones.
     """
     network: Any = SkillNetwork(config)
+    params = config.prepared(params)
     temperature = jnp.float32(judged.temperature) if judged.tempered else None
 
     def see(obs: Array) -> tuple[Array, Carry]:
