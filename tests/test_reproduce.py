@@ -189,7 +189,9 @@ def test_figures_are_drawn_of_published_results(
     (drawn,) = comparisons.draw(config)
     assert drawn == tmp_path / "figure2-cpu_maze15_prompts.png"
     assert drawn.stat().st_size > 0
-    with pytest.raises(UsageError, match="figure2 is not available for crafter"):
+    absent = comparisons.Cell("crafter", "ucb", None, "no network is released")
+    monkeypatch.setattr(comparisons, "made", lambda *_: absent)
+    with pytest.raises(UsageError, match="figure2 is not available for crafter: no network is"):
         comparisons.draw(replace(config, env=("crafter",)))
 
 
