@@ -390,7 +390,7 @@ def test_prices_are_those_of_relatives() -> None:
         for path in Path("results/gridworld").iterdir()
         if path.name in methods.names()
     )
-    assert rate("crafter", methods.find("ucb")) is None
+    assert rate("kitchen-mjx", methods.find("spirl")) is None
 
 
 def test_a_gpu_says_nothing_about_cpu_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
