@@ -56,9 +56,9 @@ class Actor:
         self._functions = policy.policy
         self._key = jax.random.key(seed)
         self._greedy = jnp.asarray(greedy)
+        params = policy.config.prepared(policy.params)  # once, not at every step
         self._prefill, self._decode = (
-            partial(function, policy.config.prepared(policy.params))
-            for function in _compiled(policy.config)
+            partial(function, params) for function in _compiled(policy.config)
         )
         self._step = 0
         self.prompt = goals

@@ -46,6 +46,7 @@ from envs.crafter.view import (
 
 LEVELS = 255.0  # bytes are divided by this, so that brightness is between 0 and 1
 MIDDLE = NUM_CELLS // 2  # index of the cell on which the agent stands
+OTHERS = np.delete(np.arange(NUM_CELLS), MIDDLE)
 TILE = UNIT * UNIT * 3  # number of components of a tile
 
 
@@ -105,11 +106,10 @@ def tables_of(kernel: Float[Array, "64 64 3 E"], bias: Float[Array, "E"]) -> Tab
     places = by_place(kernel)
     view, below = places[:NUM_CELLS], places[NUM_CELLS : NUM_CELLS + NUM_COUNTS]
     kernels = jnp.stack([view, gray_kernel(view)])
-    others = np.delete(np.arange(NUM_CELLS), MIDDLE)
     icons = tiles(UNIT).items.reshape(NUM_COUNTS, -1, TILE) / LEVELS
     in_order = jnp.asarray(icons[[COUNTS.index(name) for name in ITEMS]], jnp.float32)
     return Tables(
-        cells=tables("day", kernels[:, others], POSSIBLE),
+        cells=tables("day", kernels[:, OTHERS], POSSIBLE),
         player=tables("player", kernels[:, MIDDLE : MIDDLE + 1]),
         items=jnp.einsum("pct,pte->pce", in_order, below),
         bias=bias,
@@ -168,12 +168,11 @@ def _with_cells(
     codes = jnp.clip(jnp.round(obs[..., :NUM_CELLS]), 0, NUM_CODES - 1).astype(jnp.int32)
     asleep = (obs[..., ASLEEP] > 0.5).astype(jnp.int32)
     light = obs[..., LIGHT, None]
-    others = np.delete(np.arange(NUM_CELLS), MIDDLE)
     facing = jnp.argmax(obs[..., NUM_CELLS + NUM_COUNTS :][..., :NUM_FACINGS], axis=-1)
     who = jnp.where(asleep > 0, NUM_FACINGS, facing)
     player = who * NUM_BLOCKS + codes[..., MIDDLE] % NUM_BLOCKS
     add = _with_looked_up if jax.default_backend() == "cpu" else _with_multiplied
-    rows = jnp.asarray(PLACE_AMONG_POSSIBLE)[codes[..., others]]
+    rows = jnp.asarray(PLACE_AMONG_POSSIBLE)[codes[..., OTHERS]]
     token = add(token, made.cells, Shown(rows, light, asleep))
     return add(token, made.player, Shown(player[..., None], light, asleep))
 
