@@ -86,10 +86,14 @@ class NetworkConfig:
         return module
 
     def prepared(self, params: Any) -> Any:
-        """Parameters with which the network acts as with ``params``, and its encoder with less work."""
-        prepare, parts = ENCODERS.find(self.encoder).prepare, params["params"]
-        if prepare is None:
+        """Parameters with which the network acts as with ``params``, and its encoder with less work.
+
+        None, the parameters of a policy that never acts, stays None.
+        """
+        prepare = ENCODERS.find(self.encoder).prepare
+        if prepare is None or params is None:
             return params
+        parts = params["params"]
         return {**params, "params": {**parts, "embed_obs": prepare(parts["embed_obs"])}}
 
     def action_numbers(self, actions: Array) -> Float[Array, "... A"]:
