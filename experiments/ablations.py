@@ -19,18 +19,15 @@ from experiments.drawing import write
 from experiments.figures import later, learning_curve
 from experiments.signals import GO_ON, farewell, kept
 from experiments.store import runs
+from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.paper import paper_value
 from experiments.store.policies import check_weights
+from experiments.store.presets import pretrain_preset
 from experiments.store.provenance import provenance
+from experiments.store.reproduce_settings import ReproduceConfig
 from experiments.store.result_files import load_results
 from experiments.store.seals import write_sealed
-from experiments.store.settings import (
-    AdaptConfig,
-    DataConfig,
-    PretrainConfig,
-    ReproduceConfig,
-    pretrain_preset,
-)
+from experiments.store.settings import DataConfig, PretrainConfig
 from experiments.store.statistics import SeedSpread
 from experiments.store.summary import read_summary
 from experiments.store.tables import number, table

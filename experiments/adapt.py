@@ -13,7 +13,7 @@ import envs
 from envs.errors import UsageError
 from experiments.joining import check_flags, join
 from experiments.runtime import refuse_existing, run, say
-from experiments.store.settings import AdaptConfig
+from experiments.store.adapt_settings import AdaptConfig
 from mgpo_jax import methods, processes
 from mgpo_jax.methods import METHODS, foreign_setting
 from mgpo_jax.settings import flag

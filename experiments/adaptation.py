@@ -16,13 +16,13 @@ from envs.errors import UsageError
 from envs.registry import World
 from experiments.joining import OF_PROCESSES
 from experiments.runtime import expect_compiling
+from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.layout import META
 from experiments.store.policies import check_weights, far_prompts
 from experiments.store.provenance import provenance
 from experiments.store.result_files import load_results, write_results
 from experiments.store.results import Results, results_of
 from experiments.store.runs import changes
-from experiments.store.settings import AdaptConfig
 from experiments.store.summary import ADAPT_AGAIN, judged_episodes, summarize
 from experiments.store.work import PIECES, long_work
 from mgpo_jax import methods, processes

@@ -26,12 +26,15 @@ from experiments.prompt_lengths import entropy_table
 from experiments.runtime import say
 from experiments.signals import GO_ON
 from experiments.store import runs
+from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.paper import paper_final, paper_worlds
+from experiments.store.presets import pretrain_preset
+from experiments.store.reproduce_settings import ReproduceConfig
 from experiments.store.result_files import load_results
 from experiments.store.results import Results
 from experiments.store.rows import PAPER_EPISODES, read_row
 from experiments.store.seals import check_replaceable, write_sealed
-from experiments.store.settings import AdaptConfig, ReproduceConfig, file_name, pretrain_preset
+from experiments.store.settings import file_name
 from experiments.store.statistics import SeedSpread
 from experiments.store.summary import read_summary
 from experiments.store.tables import number, table

@@ -13,7 +13,8 @@ import envs
 from envs.base import Environment, Task
 from envs.registry import World
 from experiments.inventory import price_of, seconds_per_episode
-from experiments.store.settings import AdaptConfig, PretrainConfig
+from experiments.store.adapt_settings import AdaptConfig
+from experiments.store.settings import PretrainConfig
 from experiments.store.summary import judged_episodes
 from experiments.store.tables import block
 from experiments.training import sized_network

@@ -19,8 +19,8 @@ from envs.registry import WORLDS, World
 from experiments.datasets import find_demonstrator
 from experiments.drawing import write
 from experiments.figures import Glance, at_a_glance, later, look_of
+from experiments.store.reproduce_settings import ReproduceConfig
 from experiments.store.seals import check_replaceable
-from experiments.store.settings import ReproduceConfig
 
 SEED = 0
 

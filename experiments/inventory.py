@@ -24,19 +24,12 @@ from experiments.comparisons import (
     worlds_of,
 )
 from experiments.store import runs
+from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.layout import META
 from experiments.store.metrics import METRICS, read_metrics
 from experiments.store.provenance import read_meta
-from experiments.store.settings import (
-    ABLATIONS,
-    COMPARISONS,
-    DEFAULT_WORLD,
-    GLANCE,
-    AdaptConfig,
-    PretrainConfig,
-    ReproduceConfig,
-    file_name,
-)
+from experiments.store.reproduce_settings import ABLATIONS, COMPARISONS, GLANCE, ReproduceConfig
+from experiments.store.settings import DEFAULT_WORLD, PretrainConfig, file_name
 from experiments.store.summary import ADAPT_AGAIN, read_summary
 from experiments.store.tables import table
 from mgpo_jax import methods

@@ -8,8 +8,9 @@ from typing import NoReturn
 
 from experiments.joining import check_flags, join
 from experiments.runtime import run, say
+from experiments.store.presets import check_pretraining, pretrain_default
 from experiments.store.runs import check_start
-from experiments.store.settings import PretrainConfig, check_pretraining, pretrain_default
+from experiments.store.settings import PretrainConfig
 from mgpo_jax.manifest import read_facts
 
 

@@ -21,7 +21,7 @@ import envs
 from envs.errors import DataError, NotAvailableError, UsageError, nearest, printable
 from experiments.joining import join
 from experiments.runtime import run, say
-from experiments.store.settings import (
+from experiments.store.reproduce_settings import (
     ABLATIONS,
     ALL,
     COMPARISONS,

@@ -35,8 +35,9 @@ from experiments.signals import farewell, kept
 from experiments.store.layout import SUMMARY
 from experiments.store.paper import paper_value
 from experiments.store.provenance import provenance
+from experiments.store.reproduce_settings import ReproduceConfig
 from experiments.store.seals import check_replaceable, write_sealed
-from experiments.store.settings import ReproduceConfig, file_name
+from experiments.store.settings import file_name
 from experiments.store.statistics import SeedSpread
 from experiments.store.summary import Summary, read_summary
 from experiments.store.tables import table

@@ -15,9 +15,9 @@ from envs.errors import UsageError, nearest, shown
 from envs.registry import World
 from experiments.adaptation import adapt_all, deciding, results_with_summary
 from experiments.runtime import say
+from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.provenance import provenance
 from experiments.store.result_files import write_results
-from experiments.store.settings import AdaptConfig
 from experiments.store.work import long_work
 from mgpo_jax import methods, processes
 from mgpo_jax.methods import foreign_setting, split_hyper

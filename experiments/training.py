@@ -25,15 +25,10 @@ from experiments.figures import training_curve
 from experiments.runtime import expect_compiling
 from experiments.signals import Stopped, asked_to_stop, farewell
 from experiments.store import runs
+from experiments.store.initial import check_initial, initial_folder, mend_initial
 from experiments.store.metrics import METRICS, Metrics, check_loggers, salvaged_rows
 from experiments.store.provenance import provenance
-from experiments.store.settings import (
-    NO_WORLD,
-    PretrainConfig,
-    check_initial,
-    initial_folder,
-    mend_initial,
-)
+from experiments.store.settings import NO_WORLD, PretrainConfig
 from experiments.training_data import own_dataset, prepare_dataset
 from mgpo_jax import processes
 from mgpo_jax.archives import let_go

@@ -16,7 +16,7 @@ from envs.errors import UsageError
 from experiments import measurements
 from experiments.bench import BenchConfig, main
 from experiments.measurements import sequence_flops
-from experiments.store.settings import pretrain_preset
+from experiments.store.presets import pretrain_preset
 from mgpo_jax.kinds import kind_of
 from mgpo_jax.transformer import TransformerConfig
 

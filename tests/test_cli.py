@@ -26,7 +26,8 @@ from envs.registry import WORLDS
 from experiments import pretrain, runtime, training
 from experiments.__main__ import COMMANDS
 from experiments.parsing import parse
-from experiments.store.settings import PretrainConfig, pretrain_default, pretrain_preset
+from experiments.store.presets import pretrain_default, pretrain_preset
+from experiments.store.settings import PretrainConfig
 from mgpo_jax import methods
 from mgpo_jax.dataset import load_dataset
 from mgpo_jax.files import hash_file

@@ -13,7 +13,9 @@ from experiments.adapt import adapt_default
 from experiments.config_files import expanded
 from experiments.parsing import parse
 from experiments.runtime import run
-from experiments.store.settings import AdaptConfig, PretrainConfig, pretrain_default
+from experiments.store.adapt_settings import AdaptConfig
+from experiments.store.presets import pretrain_default
+from experiments.store.settings import PretrainConfig
 from experiments.table import TableConfig
 from mgpo_jax.files import to_json
 

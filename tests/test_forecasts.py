@@ -8,7 +8,9 @@ import pytest
 
 from experiments import adapt, pretrain
 from experiments.parsing import parse
-from experiments.store.settings import AdaptConfig, PretrainConfig, pretrain_default
+from experiments.store.adapt_settings import AdaptConfig
+from experiments.store.presets import pretrain_default
+from experiments.store.settings import PretrainConfig
 
 ROOT = Path(__file__).parents[1]
 

@@ -15,7 +15,7 @@ from envs.registry import World
 from experiments import glance
 from experiments.figures import Glance, at_a_glance, look_of
 from experiments.reproduce import main
-from experiments.store.settings import ReproduceConfig
+from experiments.store.reproduce_settings import ReproduceConfig
 
 
 def test_worlds_of_one_home_share_a_panel(capsys: pytest.CaptureFixture[str]) -> None:

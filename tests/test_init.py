@@ -24,15 +24,10 @@ from envs.base import ArraySpec, Discrete, EnvSpec
 from envs.errors import DataError, UsageError
 from experiments import runtime, training
 from experiments.parsing import parse
+from experiments.store.initial import initial_at
+from experiments.store.presets import pretrain_default, pretrain_preset
 from experiments.store.runs import begin, check_start, has_begun, identity
-from experiments.store.settings import (
-    DEFAULT_WORLD,
-    PretrainConfig,
-    initial_at,
-    pretrain_default,
-    pretrain_preset,
-    training_settings,
-)
+from experiments.store.settings import DEFAULT_WORLD, PretrainConfig, training_settings
 from mgpo_jax import Dataset, LoadedPolicy, TrainConfig, pretrain
 from mgpo_jax.files import hash_file
 from mgpo_jax.policy_files import read_policy, save_policy

@@ -13,7 +13,8 @@ from test_training import DATASET
 import envs
 from envs.base import ArraySpec, Discrete, EnvSpec
 from envs.errors import DataError, UsageError
-from experiments.store.settings import PretrainConfig, pretrain_preset
+from experiments.store.presets import pretrain_preset
+from experiments.store.settings import PretrainConfig
 from mgpo_jax import methods
 from mgpo_jax.baselines.commanded import CommandConfig
 from mgpo_jax.baselines.skills import SkillConfig

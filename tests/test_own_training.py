@@ -13,8 +13,9 @@ from hostile.work import Evaluation, WorkBegan, begin
 
 from experiments import runtime, training
 from experiments.parsing import parse
+from experiments.store.presets import pretrain_default, with_settings
 from experiments.store.recipes import recipe, schedule, told
-from experiments.store.settings import PretrainConfig, pretrain_default, with_settings
+from experiments.store.settings import PretrainConfig
 from experiments.training import moments
 from mgpo_jax import Actor, Dataset, load_policy, save_dataset
 from mgpo_jax.manifest import Facts, SpecEntry, read_facts

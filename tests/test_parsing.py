@@ -24,14 +24,13 @@ from experiments.plot import PlotConfig
 from experiments.pretrain import main as pretrain
 from experiments.release import ReleaseConfig
 from experiments.reproduce import main as reproduce
+from experiments.store.adapt_settings import AdaptConfig
+from experiments.store.presets import pretrain_default, pretrain_preset
+from experiments.store.reproduce_settings import ReproduceConfig
 from experiments.store.settings import (
     NO_SETTINGS,
-    AdaptConfig,
     CollectConfig,
     PretrainConfig,
-    ReproduceConfig,
-    pretrain_default,
-    pretrain_preset,
     pretraining_from,
     saved_pretraining,
     training_settings,

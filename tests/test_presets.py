@@ -10,7 +10,7 @@ import envs
 from envs.errors import UsageError
 from envs.registry import WORLDS
 from experiments.store.paper import METHODS_IN, paper_final, paper_rows, paper_value
-from experiments.store.settings import pretrain_preset
+from experiments.store.presets import pretrain_preset
 from mgpo_jax.methods import METHODS
 
 

@@ -17,10 +17,12 @@ from envs import episodes
 from envs.errors import DataError, NotAvailableError, UsageError
 from experiments import ablations, comparisons, inventory, reproduce, robustness
 from experiments.reproduce import main
-from experiments.store import settings as store_settings
+from experiments.store import reproduce_settings
 from experiments.store.paper import paper_worlds
+from experiments.store.presets import pretrain_preset
+from experiments.store.reproduce_settings import ReproduceConfig
 from experiments.store.result_files import load_results
-from experiments.store.settings import PretrainConfig, ReproduceConfig, pretrain_preset
+from experiments.store.settings import PretrainConfig
 from experiments.store.summary import read_summary
 from mgpo_jax import methods
 from mgpo_jax.settings import check_settings
@@ -41,7 +43,7 @@ def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Trainings of two steps and adaptations of two episodes to two tasks."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("MGPO_DATA", raising=False)
-    for module in (ablations, store_settings):
+    for module in (ablations, reproduce_settings):
         monkeypatch.setattr(module, "pretrain_preset", tiny_preset)
     monkeypatch.setattr(ablations, "EPISODES", 2)
     monkeypatch.setattr(episodes, "MAX_SEGMENTS", 1)

@@ -15,7 +15,7 @@ from experiments import comparisons, robustness
 from experiments.comparisons import Cell
 from experiments.evaluation import Noise
 from experiments.robustness import Behind, Row
-from experiments.store.settings import ReproduceConfig
+from experiments.store.reproduce_settings import ReproduceConfig
 from experiments.store.summary import read_summary
 
 CONFIG = ReproduceConfig(what="table3", env=("kitchen",), only=("ucb",))

@@ -17,7 +17,7 @@ from envs.wrappers import Noisy
 from experiments import adaptation, sweeping
 from experiments.adapt import main
 from experiments.adaptation import adapt_all, chosen_tasks
-from experiments.store.settings import AdaptConfig
+from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.summary import BEHIND_NOISE, judged_episodes
 from mgpo_jax import policy_files
 from mgpo_jax.methods import UCB

@@ -14,8 +14,8 @@ from envs.errors import UsageError
 from envs.registry import WORLDS
 from experiments import adapt
 from experiments.parsing import parse
+from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.result_files import load_results
-from experiments.store.settings import AdaptConfig
 from experiments.sweeping import variants
 from mgpo_jax import runner
 from mgpo_jax.policy import LoadedPolicy

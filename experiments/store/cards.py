@@ -14,9 +14,10 @@ from envs.errors import DataError, UsageError, printable, shown
 from envs.registry import WORLDS, World
 from experiments.datasets import find_demonstrator
 from experiments.figures import training_curve
+from experiments.store.initial import INIT
 from experiments.store.metrics import METRICS, RESUME, read_metrics
 from experiments.store.provenance import read_meta
-from experiments.store.settings import INIT, NO_WORLD, PretrainConfig, pretraining_from
+from experiments.store.settings import NO_WORLD, PretrainConfig, pretraining_from
 from mgpo_jax.dataset import variant_counts
 from mgpo_jax.files import new_folder, write_text
 from mgpo_jax.kinds import MULTI_GOAL, Kind, kind_of

@@ -17,9 +17,9 @@ import numpy as np
 
 from envs.errors import DataError
 from envs.registry import WORLDS, World
+from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.layout import ARRAYS, CONFIG, SUMMARY, TASKS
 from experiments.store.paper import paper_final
-from experiments.store.settings import AdaptConfig
 from experiments.store.statistics import (
     Interval,
     PartShare,

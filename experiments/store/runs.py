@@ -19,15 +19,11 @@ from pathlib import Path
 from typing import Any
 
 from envs.errors import DataError, UsageError, shown
+from experiments.store.initial import INIT, goes_on, initial_at, initial_folder, read_initial
 from experiments.store.provenance import count_devices
 from experiments.store.settings import (
     DEFAULT_WORLD,
-    INIT,
     PretrainConfig,
-    goes_on,
-    initial_at,
-    initial_folder,
-    read_initial,
     saved_pretraining,
     training_settings,
 )

@@ -35,7 +35,7 @@ from envs.kitchen.physics import PhysicsState
 from experiments.datasets import collect, find_demonstrator
 from experiments.measurements import bench_gradient_step
 from experiments.runtime import configure
-from experiments.store.settings import pretrain_preset
+from experiments.store.presets import pretrain_preset
 from experiments.training import configured_network
 from mgpo_jax import runner
 from mgpo_jax.policy_files import load_policy
