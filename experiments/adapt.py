@@ -57,7 +57,7 @@ def main(config: AdaptConfig) -> None:
     join(config)
     from envs.wrappers import behind_noise
     from experiments.adaptation import adapt_and_save, chosen_tasks, finished
-    from experiments.store.summary import printed
+    from experiments.store.summary_text import printed
     from mgpo_jax.policy_files import load_policy
 
     env = behind_noise(envs.make(config.env), config.obs_noise, config.action_noise)

@@ -26,7 +26,8 @@ from experiments.store.metrics import read_metrics
 from experiments.store.policies import load_policy_of
 from experiments.store.result_files import PARTS, load_results, save_results
 from experiments.store.results import Results, results_of
-from experiments.store.summary import printed, read_summary, summarize
+from experiments.store.summary import read_summary, summarize
+from experiments.store.summary_text import printed
 from mgpo_jax.kinds import MULTI_GOAL
 from mgpo_jax.methods import BbtHyper, policy_kind
 from mgpo_jax.policy import LoadedPolicy

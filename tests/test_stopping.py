@@ -12,7 +12,8 @@ from test_runner import MAZE, Point, tasks_of, untrained
 from envs.registry import WORLDS, Judgement, World
 from experiments.store.result_files import load_results, save_results
 from experiments.store.results import results_of
-from experiments.store.summary import printed, summarize
+from experiments.store.summary import summarize
+from experiments.store.summary_text import printed
 from mgpo_jax.journal import Journal
 from mgpo_jax.methods import UCB
 from mgpo_jax.runner import sweep

@@ -22,7 +22,8 @@ from experiments.store.result_files import load_results, save_results
 from experiments.store.results import Results
 from experiments.store.rows import HEAD, STATED, Row, comparison, read_row
 from experiments.store.seals import check_replaceable, is_sealed, sealed, write_sealed
-from experiments.store.summary import printed, read_summary, solvable_tasks, summarize
+from experiments.store.summary import read_summary, solvable_tasks, summarize
+from experiments.store.summary_text import printed
 from experiments.store.tables import block, shortened, table
 from experiments.table import TableConfig, main
 
