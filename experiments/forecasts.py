@@ -13,11 +13,11 @@ import envs
 from envs.base import Environment, Task
 from envs.registry import World
 from experiments.inventory import price_of, seconds_per_episode
+from experiments.networks import sized_network
 from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.settings import PretrainConfig
 from experiments.store.summary import judged_episodes
 from experiments.store.tables import block
-from experiments.training import sized_network
 from mgpo_jax import methods
 from mgpo_jax.dataset import spec_of
 from mgpo_jax.files import to_json

@@ -22,9 +22,9 @@ from envs.errors import UsageError
 from envs.registry import World
 from envs.wrappers import Wrapper
 from experiments.datasets import collect, find_demonstrator
+from experiments.networks import configured_network
 from experiments.store.presets import pretrain_preset
 from experiments.store.settings import PretrainConfig
-from experiments.training import configured_network
 from mgpo_jax import methods, processes
 from mgpo_jax.dataset import BatchPlan, Dataset
 from mgpo_jax.lanes import cache_bytes, lanes_together, together

@@ -1,4 +1,4 @@
-"""Pre-training runs: the dataset, gradient steps, checkpoints, evaluations, and the trained policy."""
+"""Pre-training runs from the dataset to the trained policy: gradient steps, checkpoints and metrics."""
 
 from __future__ import annotations
 
@@ -7,31 +7,27 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import Array
 
 import envs
-from envs.base import Demonstrator, Environment, EnvSpec, Task
-from envs.episodes import run_episode
-from envs.errors import DataError, UsageError
-from envs.registry import World
+from envs.base import Environment
 from experiments.datasets import find_demonstrator
 from experiments.figures import training_curve
+from experiments.networks import configured_network, initial_policy
 from experiments.runtime import expect_compiling
 from experiments.signals import Stopped, asked_to_stop, farewell
 from experiments.store import runs
-from experiments.store.initial import check_initial, initial_folder, mend_initial
 from experiments.store.metrics import METRICS, Metrics, check_loggers, salvaged_rows
 from experiments.store.provenance import provenance
 from experiments.store.settings import NO_WORLD, PretrainConfig
 from experiments.training_data import own_dataset, prepare_dataset
+from experiments.watching import watched
 from mgpo_jax import processes
-from mgpo_jax.archives import let_go
 from mgpo_jax.checkpoint import (
     Snapshot,
     checkpoints,
@@ -43,19 +39,12 @@ from mgpo_jax.checkpoint import (
 from mgpo_jax.claims import claimed
 from mgpo_jax.dataset import BatchPlan, Dataset, spec_of
 from mgpo_jax.files import remove_unfinished, to_json, written
-from mgpo_jax.kinds import KINDS, MULTI_GOAL, kind_of
-from mgpo_jax.lanes import together
 from mgpo_jax.manifest import read_facts
-from mgpo_jax.optimizers.methods import judged_query
-from mgpo_jax.policy import LoadedPolicy, transformer_policy
-from mgpo_jax.policy_files import MEND, read_policy, save_policy
+from mgpo_jax.policy_files import save_policy
 from mgpo_jax.progress import Progress
-from mgpo_jax.prompts import Prompt, sample_prompt, single_goal
-from mgpo_jax.rollout import rollout
 from mgpo_jax.seen_goals import seen_in
 from mgpo_jax.settings import TrainConfig
 from mgpo_jax.sharding import device_mesh, devices_for, fetch
-from mgpo_jax.tasks import EVAL_SEED, evaluation_tasks
 from mgpo_jax.training import (
     ASKED,
     Trainer,
@@ -65,209 +54,7 @@ from mgpo_jax.training import (
     finite_metrics,
     learning_rate_schedule,
 )
-from mgpo_jax.transformer import NetworkConfig, TransformerConfig, world_side
-
-CONSTANT = 1e-4  # observation components with a smaller standard deviation are not scaled
-PERFECT = 1e-3  # demonstrations whose return is this close to the optimum count as perfect
-
-
-def initial_policy(config: PretrainConfig, spec: EnvSpec) -> LoadedPolicy | None:
-    """The policy that a run starts from; None if it starts from random weights.
-
-    Raises:
-      UsageError: if there is no policy in the folder, or the settings contradict its network.
-      DataError: if it is damaged, of another world, or not the one that a resumed run started from.
-    """
-    if config.init is None:
-        return None
-    try:
-        policy = read_policy(initial_folder(config), spec, config.method)
-    except DataError as error:
-        raise DataError(str(error).replace(MEND, mend_initial(config))) from None
-    if (found := kind_of(policy.config).name) != config.method:
-        raise UsageError(
-            f"--method {config.method} cannot start from {config.init}, a network of the kind {found}"
-        )
-    runs.check_same_start(config, policy.sha256)
-    check_initial(config)
-    return policy
-
-
-def configured_network(
-    config: PretrainConfig,
-    env: Environment | None,
-    dataset: Dataset,
-    init: LoadedPolicy | None = None,
-    spec: EnvSpec | None = None,
-) -> Any:
-    """The network config of a run: that of the policy that it starts from, or one made of its settings.
-
-    Args:
-      config: settings of the run.
-      env: the world; None for a dataset without one.
-      dataset: the dataset, for the moments of the observations.
-      init: the policy that the run starts from, if any.
-      spec: describes the data if there is no world.
-    """
-    if init is not None:
-        return replace(init.config, dropout=config.dropout)
-    spec = env.spec if env is not None else spec
-    assert spec is not None
-    learned = KINDS.find(config.method).load()
-    network = learned.complete(sized_network(config, spec), env, dataset)
-    if not config.standardize_obs:
-        return network
-    mean, std = moments(dataset.obs)
-    std = np.where(std < CONSTANT, 1.0, std)
-    return replace(network, obs_mean=tuple(mean.tolist()), obs_std=tuple(std.tolist()))
-
-
-def sized_network(config: PretrainConfig, spec: EnvSpec) -> Any:
-    """The network config that the settings imply, without anything that depends on the data."""
-    learned = KINDS.find(config.method).load()
-    common = {f.name for f in fields(learned.config)} & {f.name for f in fields(PretrainConfig)}
-    sizes = {name: getattr(config, name) for name in common}
-    return learned.config(**{**sizes, **world_side(spec, config.head, config.encoder)})
-
-
-def moments(obs: np.ndarray, piece: int = 1 << 24) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation of each component of the observations, float64 [D].
-
-    Rows are added up in order, ``piece`` numbers at a time, so that a memory-mapped array needs little
-    memory. The result equals ``numpy.mean`` and ``numpy.std`` bit for bit if D is above 1.
-
-    Args:
-      obs: observations [N, ...].
-      piece: how many numbers are converted at once.
-    """
-    size = int(np.prod(obs.shape[1:], dtype=np.int64))
-    step = max(1, piece // size)
-
-    def total(of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        found = np.zeros(size)
-        for first in range(0, len(obs), step):
-            rows = of(np.asarray(obs[first : first + step]).reshape(-1, size).astype(np.float64))
-            found = np.add.reduce(np.concatenate([found[None], rows]), axis=0)
-            let_go(obs)
-        return found
-
-    mean = total(lambda rows: rows) / len(obs)
-    return mean, np.sqrt(total(lambda rows: np.square(rows - mean)) / len(obs))
-
-
-class ReturnsOnTheWay:
-    """Evaluates a policy during training: mean returns on evaluation tasks, none of which is a test task.
-
-    The policy runs one episode per task in the world that the data was collected in. It acts greedily,
-    unless the world's record says that policies are judged by sampled actions.
-
-    ``initial_return`` is the return under the prompt (g^M). ``followed_return`` is that under a prompt
-    drawn from a perfect demonstration of the task, which shows how well the policy follows a good prompt.
-    It is missing if the optimum is unknown, or if most demonstrations are not perfect (in mazes,
-    demonstrators pursue goals of their own). If the world has variants, each has its own means as well.
-    """
-
-    def __init__(
-        self,
-        world: World,
-        env: Environment,
-        network: TransformerConfig,
-        demonstrator: Demonstrator | None,
-        num: int,
-    ) -> None:
-        place = (demonstrator.env if demonstrator else None) or env
-        self.tasks = evaluation_tasks(place, num, world.num_test_tasks, tested=env)
-        self.optimum = jax.jit(jax.vmap(place.optimal_return))(self.tasks)
-        self.keys = jax.random.split(jax.random.key(EVAL_SEED), (3, num))
-        self._variants = _variants(demonstrator, self.tasks)
-        num_slots = network.max_prompt_length
-
-        def demonstrated(
-            key: PRNGKeyArray, key_prompt: PRNGKeyArray, task: Task, weights: Any
-        ) -> tuple[Prompt, Array]:
-            assert demonstrator is not None  # else this is never called
-            episode = run_episode(key, place, demonstrator.agent(weights), task)
-            goals = episode.trajectory.goals
-            confirmed = goals.goal_reached & (episode.rewards > 0)
-            kept = confirmed if place.spec.reward_confirms_goals else None
-            prompt = sample_prompt(key_prompt, goals, place.task_goal(task), num_slots, kept=kept)
-            return prompt, episode.return_
-
-        def judged_return(params: Any, key: PRNGKeyArray, task: Task, prompt: Prompt) -> Array:
-            policy = transformer_policy(network, params)
-            return rollout(key, place, policy, task, judged_query(prompt, world.judged)).return_
-
-        self._returns = together(place, judged_return, in_axes=(None, 0, 0, 0))
-        self._initial = jax.vmap(lambda task: single_goal(place.task_goal(task), num_slots))(
-            self.tasks
-        )
-        self._perfect = np.zeros(num, bool)
-        # Otherwise there are no demonstrations, or it is unknown which of them are perfect.
-        if demonstrator is not None and np.isfinite(self.optimum).all():
-            demonstrate = together(place, demonstrated, in_axes=(0, 0, 0, None))
-            self._followed, returns = demonstrate(
-                self.keys[0], self.keys[1], self.tasks, demonstrator.weights
-            )
-            self._perfect = np.asarray(returns > self.optimum - PERFECT)
-
-    def __call__(self, params: Any) -> dict[str, float]:
-        """The metrics of some weights."""
-        initial = np.asarray(self._returns(params, self.keys[2], self.tasks, self._initial))
-        everything = np.ones(len(initial), bool)
-        found = self._means("eval/initial_return", initial, everything)
-        if np.isfinite(self.optimum).all():
-            found["eval/initial_regret"] = float(np.mean(np.asarray(self.optimum) - initial))
-        if self._perfect.mean() > 0.5:
-            followed = np.asarray(self._returns(params, self.keys[2], self.tasks, self._followed))
-            found |= self._means("eval/followed_return", followed, self._perfect)
-        return found
-
-    def _means(self, name: str, values: np.ndarray, counts: np.ndarray) -> dict[str, float]:
-        """The mean over the tasks that count, and over those of each variant."""
-        groups = {"": counts, **{tail: counts & one for tail, one in self._variants.items()}}
-        return {name + tail: float(values[one].mean()) for tail, one in groups.items() if one.any()}
-
-
-def _variants(demonstrator: Demonstrator | None, tasks: Task) -> dict[str, np.ndarray]:
-    """Masks of the tasks of each variant of the world, by the suffix of its metrics' names."""
-    if demonstrator is None:
-        return {}
-    variants = np.asarray(jax.vmap(demonstrator.variant)(tasks))
-    return {f"_{name}": variants == index for index, name in enumerate(demonstrator.variants)}
-
-
-class ReturnsByItself:
-    """Evaluates a network without prompts during training: its mean return on evaluation tasks."""
-
-    def __init__(self, world: World, env: Environment, network: NetworkConfig, num: int) -> None:
-        agent = kind_of(network).load().agent
-        assert agent is not None  # ``watched`` makes sure of it
-        self._tasks = evaluation_tasks(env, num, world.num_test_tasks)
-        self._keys = jax.random.split(jax.random.key(EVAL_SEED), num)
-
-        def return_of(params: Any, key: PRNGKeyArray, task: Task) -> Array:
-            acting = agent(network, params, world.judged)
-            return run_episode(key, env, acting, task).return_
-
-        self._returns = together(env, return_of, in_axes=(None, 0, 0))
-
-    def __call__(self, params: Any) -> dict[str, float]:
-        """The metrics of some weights."""
-        returns = self._returns(params, self._keys, self._tasks)
-        return {"eval/initial_return": float(np.mean(returns))}
-
-
-def watched(
-    world: World,
-    env: Environment,
-    network: NetworkConfig,
-    demonstrator: Demonstrator | None,
-    num: int,
-) -> Callable[[Any], dict[str, float]]:
-    """``(params) -> metrics``, the evaluation of a training on ``num`` tasks."""
-    if isinstance(network, TransformerConfig) and kind_of(network).name == MULTI_GOAL:
-        return ReturnsOnTheWay(world, env, network, demonstrator, num)
-    return ReturnsByItself(world, env, network, num)
+from mgpo_jax.transformer import world_side
 
 
 class Run:

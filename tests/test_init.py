@@ -22,7 +22,7 @@ from jax.flatten_util import ravel_pytree
 
 from envs.base import ArraySpec, Discrete, EnvSpec
 from envs.errors import DataError, UsageError
-from experiments import runtime, training
+from experiments import networks, runtime, training, watching
 from experiments.parsing import parse
 from experiments.store.initial import initial_at
 from experiments.store.presets import pretrain_default, pretrain_preset
@@ -72,7 +72,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(root)
         patch.setattr(runtime, "configure", lambda: None)
-        patch.setattr(training, "ReturnsOnTheWay", Evaluation)
+        patch.setattr(watching, "ReturnsOnTheWay", Evaluation)
         patch.delenv("MGPO_DATA", raising=False)
         assert call(FIRST) == 0
         first = read_policy(Path("first/policy"))
@@ -90,7 +90,7 @@ def here(runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     shutil.copytree(runs, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(runtime, "configure", lambda: None)
-    monkeypatch.setattr(training, "ReturnsOnTheWay", Evaluation)
+    monkeypatch.setattr(watching, "ReturnsOnTheWay", Evaluation)
     monkeypatch.delenv("MGPO_DATA", raising=False)
     return tmp_path
 
@@ -126,7 +126,7 @@ def test_the_first_step_starts_from_the_weights_of_the_policy(here: Path) -> Non
     """Moments and schedule start afresh; the network is that of the policy, but for its dropout."""
     config = parsed(f"{ON} --dropout 0.25")
     first = read_policy(Path("first/policy"))
-    init = training.initial_policy(config, training.envs.make("maze15").spec)
+    init = networks.initial_policy(config, training.envs.make("maze15").spec)
     assert init is not None
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training.runs, "has_begun", lambda folder: False)

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from hostile.work import Evaluation, WorkBegan, begin
 
-from experiments import runtime, training
+from experiments import runtime, training, watching
+from experiments.networks import moments
 from experiments.parsing import parse
 from experiments.store.presets import pretrain_default, with_settings
 from experiments.store.recipes import recipe, schedule, told
 from experiments.store.settings import PretrainConfig
-from experiments.training import moments
 from mgpo_jax import Actor, Dataset, load_policy, save_dataset
 from mgpo_jax.manifest import Facts, SpecEntry, read_facts
 from mgpo_jax.policy_files import read_policy
@@ -73,7 +73,7 @@ def here(trained, tmp_path, monkeypatch):
     shutil.copytree(trained, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(runtime, "configure", lambda: None)
-    monkeypatch.setattr(training, "ReturnsOnTheWay", Evaluation)
+    monkeypatch.setattr(watching, "ReturnsOnTheWay", Evaluation)
     return tmp_path
 
 

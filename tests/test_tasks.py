@@ -13,9 +13,9 @@ import envs
 from envs.errors import DataError, UsageError
 from envs.registry import Judgement
 from envs.wrappers import Wrapper
-from experiments import training
+from experiments import watching
 from experiments.datasets import find_demonstrator
-from experiments.training import ReturnsOnTheWay
+from experiments.watching import ReturnsOnTheWay
 from mgpo_jax.optimizers.methods import judged_query
 from mgpo_jax.prompts import single_goal
 from mgpo_jax.released import released_folder
@@ -179,7 +179,7 @@ def test_what_a_policy_makes_of_a_demonstration(name, demonstrates, monkeypatch)
         return judged_query(prompt, judged)
 
     # Policies act there as the world judges them.
-    monkeypatch.setattr(training, "judged_query", noted)
+    monkeypatch.setattr(watching, "judged_query", noted)
     world = replace(world, judged=Judgement("sample", 0.5, episodes=3) if demonstrates else GREEDY)
     evaluated = ReturnsOnTheWay(world, env, config, demonstrator, 4)
     found = evaluated(params)

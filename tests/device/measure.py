@@ -34,9 +34,9 @@ from envs.kitchen.native import Stepper
 from envs.kitchen.physics import PhysicsState
 from experiments.datasets import collect, find_demonstrator
 from experiments.measurements import bench_gradient_step
+from experiments.networks import configured_network
 from experiments.runtime import configure
 from experiments.store.presets import pretrain_preset
-from experiments.training import configured_network
 from mgpo_jax import runner
 from mgpo_jax.policy_files import load_policy
 from mgpo_jax.tasks import test_tasks

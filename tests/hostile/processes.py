@@ -385,10 +385,10 @@ def _remember(module: Any, name: str) -> None:
 
 def _stay(answer: socket.socket) -> NoReturn:
     """Run one command line after another."""
-    from experiments import training
+    from experiments import training, watching
 
-    for name in ("Trainer", "ReturnsOnTheWay"):
-        _remember(training, name)
+    _remember(training, "Trainer")
+    _remember(watching, "ReturnsOnTheWay")
     while True:
         message, files, *_ = socket.recv_fds(answer, 1 << 16, 2)
         if not message:

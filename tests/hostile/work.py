@@ -30,7 +30,7 @@ class Evaluation:
         return {"eval/initial_return": -1.0, "eval/initial_regret": 0.5}
 
 
-EVALUATION = ("experiments.training", "ReturnsOnTheWay", Evaluation)
+EVALUATION = ("experiments.watching", "ReturnsOnTheWay", Evaluation)
 PLACES: tuple[tuple[str, str, Any], ...] = (
     ("experiments.runtime", "configure", lambda: None),
     ("experiments.datasets", "program_of", begin),
