@@ -22,11 +22,11 @@ from mgpo_jax import methods
 from mgpo_jax.dataset import spec_of
 from mgpo_jax.files import to_json
 from mgpo_jax.kinds import MULTI_GOAL
+from mgpo_jax.losses import initial_params
 from mgpo_jax.manifest import read_facts
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.runner import log_bytes
 from mgpo_jax.tasks import num_tasks
-from mgpo_jax.training import initial_params
 
 OPTIMIZER = 3  # copies of the weights in a gradient step, at least: weights, gradient, a moment
 

@@ -45,16 +45,9 @@ from mgpo_jax.progress import Progress
 from mgpo_jax.seen_goals import seen_in
 from mgpo_jax.settings import TrainConfig
 from mgpo_jax.sharding import device_mesh, devices_for, fetch
-from mgpo_jax.training import (
-    ASKED,
-    Trainer,
-    TrainState,
-    batch_stream,
-    diverged,
-    finite_metrics,
-    learning_rate_schedule,
-)
+from mgpo_jax.training import ASKED, Trainer, TrainState, batch_stream, diverged, finite_metrics
 from mgpo_jax.transformer import world_side
+from mgpo_jax.weight_updates import learning_rate_schedule
 
 
 class Run:

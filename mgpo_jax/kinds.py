@@ -36,7 +36,7 @@ class Learned:
         that are also settings of pre-training (``PretrainConfig``) are taken from there.
       init: ``(key, config) -> params``, randomly initialized parameters.
       loss: ``(params, key, config, trajectory, deterministic, obs_noise) -> (loss, stats)`` of one
-        trajectory, summed over its steps; see ``training.bc_loss``.
+        trajectory, summed over its steps; see ``losses.bc_loss``.
       complete: ``(config, env, dataset) -> config``, completed with what comes from the world and its data.
         Raises ``UsageError`` if there is no such network for the world.
       agent: ``(config, params, judged) -> Agent`` whose returns are monitored during training: the network
@@ -88,7 +88,7 @@ class Kind:
 
 PROMPTED = Kind(
     name=MULTI_GOAL,
-    learned="mgpo_jax.training:PROMPTED",
+    learned="mgpo_jax.losses:PROMPTED",
     title="Multi-goal Transformer",
     watched="the prompt (g^M)",
     summary="the multi-goal Transformer, which follows prompts",

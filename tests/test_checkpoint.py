@@ -28,8 +28,9 @@ from mgpo_jax.checkpoint import (
 )
 from mgpo_jax.prompts import single_goal
 from mgpo_jax.settings import TrainConfig
-from mgpo_jax.training import TrainState, make_optimizer
+from mgpo_jax.training import TrainState
 from mgpo_jax.transformer import GoalTransformer, TransformerConfig, network_config
+from mgpo_jax.weight_updates import make_optimizer
 
 SPEC = envs.make("maze15").spec
 CONFIG = network_config(SPEC, embed_dim=8, num_layers=1)

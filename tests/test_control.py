@@ -30,9 +30,9 @@ from mgpo_jax.baselines.ptgm import Ptgm
 from mgpo_jax.baselines.skills import SkillConfig
 from mgpo_jax.baselines.spirl import Kept as KeptLatent
 from mgpo_jax.baselines.spirl import Spirl
+from mgpo_jax.losses import initial_params
 from mgpo_jax.methods import Setting
 from mgpo_jax.policy import LoadedPolicy
-from mgpo_jax.training import initial_params
 from mgpo_jax.transformer import network_config, world_side
 
 pytestmark = pytest.mark.slow

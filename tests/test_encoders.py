@@ -16,13 +16,14 @@ from envs.errors import UsageError
 from envs.maze.env import MazeRunner
 from envs.wrappers import Noisy, Wrapper
 from mgpo_jax.dataset import BatchPlan, Dataset, load_dataset, save_dataset
+from mgpo_jax.losses import bc_loss
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.prompts import Prompt
 from mgpo_jax.runner import adapt
 from mgpo_jax.settings import ENCODERS, TrainConfig
 from mgpo_jax.sharding import device_mesh
 from mgpo_jax.tasks import sample_tasks
-from mgpo_jax.training import Trainer, batch_stream, bc_loss
+from mgpo_jax.training import Trainer, batch_stream
 from mgpo_jax.transformer import GoalTransformer, TransformerConfig, grow_cache, network_config
 
 HORIZON, NUM_SLOTS = 6, 3

@@ -21,11 +21,11 @@ from experiments.store.settings import NO_WORLD, PretrainConfig, pretraining_fro
 from mgpo_jax.dataset import variant_counts
 from mgpo_jax.files import new_folder, write_text
 from mgpo_jax.kinds import MULTI_GOAL, Kind, kind_of
+from mgpo_jax.losses import HIT
 from mgpo_jax.policy import LoadedPolicy, check_fits
 from mgpo_jax.policy_files import CONFIG, GOALS, WEIGHTS, read_policy
 from mgpo_jax.released import released_folder
 from mgpo_jax.tasks import benchmark_tasks, save_tasks
-from mgpo_jax.training import HIT
 
 FOLLOWED = "eval/followed_return"
 CARD = """# {title} for {env}
