@@ -13,9 +13,9 @@ from envs.errors import DataError, UsageError
 from experiments.store import runs
 from experiments.store.initial import check_initial, initial_folder, mend_initial
 from experiments.store.settings import PretrainConfig
-from mgpo_jax.archives import let_go
 from mgpo_jax.dataset import Dataset
 from mgpo_jax.kinds import KINDS, kind_of
+from mgpo_jax.mapped import let_go
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.policy_files import MEND, read_policy
 from mgpo_jax.transformer import world_side

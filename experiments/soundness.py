@@ -19,9 +19,9 @@ import numpy as np
 import envs
 from envs.base import EnvSpec
 from envs.errors import printable
-from mgpo_jax.archives import let_go
 from mgpo_jax.dataset import STEP_ARRAYS, Dataset, load_dataset
 from mgpo_jax.manifest import Facts, read_facts
+from mgpo_jax.mapped import let_go
 
 SAMPLE = 20_000  # maximum number of steps in a regression
 MOST_NUMBERS = 256  # maximum size of an observation or action in a regression

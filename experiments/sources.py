@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from envs.errors import DataError, UsageError, printable, shown
-from mgpo_jax.archives import ArrayField, array_headers, read_arrays
+from mgpo_jax.archives import array_headers, read_arrays
+from mgpo_jax.array_fields import ArrayField
 
 ACTIONS = ("actions", "action")
 TERMINATED = ("terminals", "terminations", "terminated")

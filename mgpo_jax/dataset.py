@@ -19,7 +19,8 @@ import numpy as np
 from envs.base import ArraySpec, Box, Discrete, EnvSpec, Trajectory
 from envs.errors import DataError, shown
 from envs.registry import WORLDS
-from mgpo_jax.archives import ArrayField, Sizes, fitted_arrays, let_go, mapped_arrays, read_arrays
+from mgpo_jax.archives import read_arrays
+from mgpo_jax.array_fields import ArrayField, Sizes
 from mgpo_jax.files import hash_file, new_folder, write_arrays, write_json
 from mgpo_jax.manifest import (
     ARRAYS,
@@ -32,6 +33,7 @@ from mgpo_jax.manifest import (
     mend_for,
     read_manifest,
 )
+from mgpo_jax.mapped import fitted_arrays, let_go, mapped_arrays
 
 SIZES: Sizes = {"trajectory": range(1, 2**31), "step": range(1, 2**31)}
 STEP_ARRAYS = tuple(name for name in Trajectory._fields if name != "length")

@@ -18,14 +18,9 @@ from annotated_types import Ge, Le, MaxLen
 from pydantic import BaseModel
 
 from envs.errors import DataError
-from mgpo_jax.archives import (
-    ArrayField,
-    ArrayHeader,
-    array_headers,
-    mapped_arrays,
-    mapped_headers,
-    read_arrays,
-)
+from mgpo_jax.archives import array_headers, read_arrays
+from mgpo_jax.array_fields import ArrayField, ArrayHeader
+from mgpo_jax.mapped import mapped_arrays, mapped_headers
 from mgpo_jax.schema import (
     STRICT,
     DemonstratorName,

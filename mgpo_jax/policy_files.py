@@ -25,7 +25,8 @@ from pydantic import BaseModel
 from envs.base import ArraySpec, EnvSpec
 from envs.errors import DataError, UsageError, shown
 from envs.registry import World, find
-from mgpo_jax.archives import ArrayField, array_names, read_arrays
+from mgpo_jax.archives import array_names, read_arrays
+from mgpo_jax.array_fields import ArrayField
 from mgpo_jax.claims import claimed, cleaned_on_exit
 from mgpo_jax.distributions import HEADS
 from mgpo_jax.files import (

@@ -4,7 +4,7 @@ A dataclass declares what is allowed: the types of its fields, to which ``Annota
 ``settings.TrainConfig``. pydantic validates strictly: ``true`` is not a number, ``"1"`` is not an integer,
 and NaN and infinity are never allowed.
 
-``mgpo_jax.archives`` does the same for files of arrays.
+``mgpo_jax.array_fields`` does the same for arrays.
 """
 
 from __future__ import annotations

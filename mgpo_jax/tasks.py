@@ -16,9 +16,11 @@ import numpy as np
 from envs.base import Environment, Task
 from envs.errors import DataError, UsageError
 from envs.registry import World, find
-from mgpo_jax.archives import ArrayField, Sizes, fitted_arrays, read_arrays
+from mgpo_jax.archives import read_arrays
+from mgpo_jax.array_fields import ArrayField, Sizes
 from mgpo_jax.dataset import hash_task
 from mgpo_jax.files import write_arrays
+from mgpo_jax.mapped import fitted_arrays
 from mgpo_jax.released import released_folder
 from mgpo_jax.trees import named_leaves
 

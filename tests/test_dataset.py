@@ -14,7 +14,6 @@ from scipy import stats
 
 from envs.base import ArraySpec, Box, Discrete, EnvSpec
 from envs.errors import DataError
-from mgpo_jax import archives
 from mgpo_jax.dataset import (
     ARRAYS,
     MANIFEST,
@@ -616,7 +615,7 @@ def test_batches_of_a_mapped_dataset_are_bit_for_bit_those_of_one_in_memory(mapp
 
 def test_what_was_let_go_is_read_again(tmp_path, monkeypatch):
     """Pages that were taken out of memory come back with what they held."""
-    monkeypatch.setattr(archives, "RESIDENT", 0)
+    monkeypatch.setattr("mgpo_jax.mapped.RESIDENT", 0)
     big = make_dataset([9] * 200)
     save_dataset(tmp_path / "big", big, {}, mapped=True)
     loaded, _ = load_dataset(tmp_path / "big", SPEC)

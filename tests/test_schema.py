@@ -19,8 +19,10 @@ from pydantic import BaseModel
 
 from envs.errors import DataError
 from envs.registry import WORLDS
-from mgpo_jax.archives import ArrayField, array_names, fitted_arrays, read_arrays
+from mgpo_jax.archives import array_names, read_arrays
+from mgpo_jax.array_fields import ArrayField
 from mgpo_jax.files import write_arrays
+from mgpo_jax.mapped import fitted_arrays
 from mgpo_jax.schema import STRICT, Json, checked_entry, read_document, read_json_lines
 
 FIELDS = {

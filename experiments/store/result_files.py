@@ -25,7 +25,8 @@ from experiments.store.layout import ARRAYS, CONFIG, META, SUMMARY, TASKS
 from experiments.store.provenance import Place, provenance, read_meta
 from experiments.store.results import Results
 from experiments.store.summary import ADAPT_AGAIN, read_summary
-from mgpo_jax.archives import LARGEST, ArrayField, Sizes, array_names, read_arrays
+from mgpo_jax.archives import array_names, read_arrays
+from mgpo_jax.array_fields import LARGEST, ArrayField, Sizes
 from mgpo_jax.files import new_folder, write_arrays, write_json
 from mgpo_jax.methods import METHODS
 from mgpo_jax.outcomes import Reached

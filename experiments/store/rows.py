@@ -38,7 +38,8 @@ from experiments.store.summary import (
     read_summary,
 )
 from experiments.store.tables import number, shortened, table
-from mgpo_jax.archives import ArrayField, array_names, read_arrays
+from mgpo_jax.archives import array_names, read_arrays
+from mgpo_jax.array_fields import ArrayField
 from mgpo_jax.methods import METHODS, policy_kind
 from mgpo_jax.released import released_folder
 from mgpo_jax.schema import read_document

@@ -26,7 +26,8 @@ from experiments.store.statistics import (
     seed_spread,
     stratified_bootstrap_iqm,
 )
-from mgpo_jax.archives import ArrayField, read_arrays
+from mgpo_jax.archives import read_arrays
+from mgpo_jax.array_fields import ArrayField
 from mgpo_jax.methods import METHODS
 from mgpo_jax.schema import STRICT, Sha256, read_document
 
