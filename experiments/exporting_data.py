@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from envs.errors import DataError
-from experiments.importing import OWN_BY_STEP, OWN_BY_TRAJECTORY
+from experiments.converting import OWN_BY_STEP, OWN_BY_TRAJECTORY
 from experiments.sources import OWN, import_extra
 from mgpo_jax.dataset import Dataset, load_dataset
 from mgpo_jax.files import new_folder, write_arrays
