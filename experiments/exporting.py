@@ -10,9 +10,9 @@ from typing import Any
 from envs.errors import MissingExtraError, UsageError
 from envs.registry import World
 from mgpo_jax.files import to_json, written
+from mgpo_jax.network_configs import OBS_LIMIT, TransformerConfig
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.policy_files import load_policy
-from mgpo_jax.transformer import OBS_LIMIT, TransformerConfig
 
 KEY = "mgpo_jax"  # key of our facts in the metadata of a model
 INSTALL = 'pip install -e ".[onnx]"'

@@ -28,6 +28,7 @@ from experiments.store.settings import PretrainConfig
 from mgpo_jax import methods, processes
 from mgpo_jax.dataset import BatchPlan, Dataset
 from mgpo_jax.lanes import cache_bytes, lanes_together, together
+from mgpo_jax.network_configs import TransformerConfig
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.policy_files import load_policy
 from mgpo_jax.prompts import Prompt, single_goal
@@ -37,7 +38,6 @@ from mgpo_jax.settings import TrainConfig
 from mgpo_jax.sharding import device_mesh, devices_for
 from mgpo_jax.tasks import benchmark_tasks
 from mgpo_jax.training import Trainer, batch_stream
-from mgpo_jax.transformer import TransformerConfig
 
 BASELINES = ("reinforce", "ppo", "ptgm", "spirl")
 NUM_BASELINE_TASKS = 4

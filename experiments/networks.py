@@ -16,9 +16,9 @@ from experiments.store.settings import PretrainConfig
 from mgpo_jax.dataset import Dataset
 from mgpo_jax.kinds import KINDS, kind_of
 from mgpo_jax.mapped import let_go
+from mgpo_jax.network_configs import world_side
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.policy_files import MEND, read_policy
-from mgpo_jax.transformer import world_side
 
 CONSTANT = 1e-4  # observation components with a smaller standard deviation are not scaled
 

@@ -15,8 +15,8 @@ import onnx
 from flax.traverse_util import flatten_dict
 from onnx import TensorProto, helper, numpy_helper
 
+from mgpo_jax.network_configs import OBS_LIMIT, TransformerConfig
 from mgpo_jax.policy import LoadedPolicy
-from mgpo_jax.transformer import OBS_LIMIT, TransformerConfig
 
 OPSET, IR_VERSION = 17, 8  # the first with LayerNormalization; older runtimes support them
 EPSILON = 1e-6  # default of flax's LayerNorm

@@ -40,13 +40,13 @@ from mgpo_jax.claims import claimed
 from mgpo_jax.dataset import BatchPlan, Dataset, spec_of
 from mgpo_jax.files import remove_unfinished, to_json, written
 from mgpo_jax.manifest import read_facts
+from mgpo_jax.network_configs import world_side
 from mgpo_jax.policy_files import save_policy
 from mgpo_jax.progress import Progress
 from mgpo_jax.seen_goals import seen_in
 from mgpo_jax.settings import TrainConfig
 from mgpo_jax.sharding import device_mesh, devices_for, fetch
 from mgpo_jax.training import ASKED, Trainer, TrainState, batch_stream, diverged, finite_metrics
-from mgpo_jax.transformer import world_side
 from mgpo_jax.weight_updates import learning_rate_schedule
 
 

@@ -14,12 +14,12 @@ from envs.episodes import run_episode
 from envs.registry import World
 from mgpo_jax.kinds import MULTI_GOAL, kind_of
 from mgpo_jax.lanes import together
+from mgpo_jax.network_configs import NetworkConfig, TransformerConfig
 from mgpo_jax.optimizers.methods import judged_query
 from mgpo_jax.policy import transformer_policy
 from mgpo_jax.prompts import Prompt, sample_prompt, single_goal
 from mgpo_jax.rollout import rollout
 from mgpo_jax.tasks import EVAL_SEED, evaluation_tasks
-from mgpo_jax.transformer import NetworkConfig, TransformerConfig
 
 PERFECT = 1e-3  # demonstrations whose return is this close to the optimum count as perfect
 

@@ -11,10 +11,10 @@ import numpy as np
 
 from envs.episodes import segment_length
 from envs.errors import UsageError
+from mgpo_jax.network_configs import TransformerConfig
 from mgpo_jax.policy import LoadedPolicy, transformer_policy
 from mgpo_jax.prompts import Prompt, prompt_of
 from mgpo_jax.rollout import act
-from mgpo_jax.transformer import TransformerConfig
 
 
 @cache

@@ -136,7 +136,7 @@ def layout_fault(layout: ObsLayout, shape: tuple[int, ...]) -> str | None:
 
 
 def _cells(obs_shape: tuple[int, ...], width: int, layout: ObsLayout | None) -> nn.Module:
-    assert layout is not None  # checked by ``transformer.network_config`` and ``policy_files``
+    assert layout is not None  # checked by ``network_configs`` and ``policy_files``
     return Cells(width, layout)
 
 

@@ -20,10 +20,11 @@ from mgpo_jax.adaptation import (
     judge,
 )
 from mgpo_jax.lanes import Grid, Lanes, Layout, cache_bytes, lay_out, over_lanes, together
+from mgpo_jax.network_configs import TransformerConfig
 from mgpo_jax.policy import LoadedPolicy, check_fits, transformer_policy
 from mgpo_jax.rollout import Query, rollout
 from mgpo_jax.sharding import fetch, replicate, split
-from mgpo_jax.transformer import GoalTransformer, TransformerConfig
+from mgpo_jax.transformer import GoalTransformer
 
 
 def evaluate(

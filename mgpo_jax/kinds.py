@@ -16,7 +16,7 @@ from envs.registry import Registry
 
 if TYPE_CHECKING:
     from envs.base import Agent
-    from mgpo_jax.transformer import NetworkConfig
+    from mgpo_jax.network_configs import NetworkConfig
 
 MULTI_GOAL = "mgpo"
 """The kind of the paper's policy, which follows prompts."""
@@ -32,8 +32,8 @@ class Learned:
     """The functions that make up a kind of network.
 
     Attributes:
-      config: the frozen dataclass of its config, which derives from ``transformer.NetworkConfig``. Fields
-        that are also settings of pre-training (``PretrainConfig``) are taken from there.
+      config: the frozen dataclass of its config, which derives from ``network_configs.NetworkConfig``.
+        Fields that are also settings of pre-training (``PretrainConfig``) are taken from there.
       init: ``(key, config) -> params``, randomly initialized parameters.
       loss: ``(params, key, config, trajectory, deterministic, obs_noise) -> (loss, stats)`` of one
         trajectory, summed over its steps; see ``losses.bc_loss``.

@@ -20,8 +20,8 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Bool, PRNGKeyArray
 
 from envs.base import Environment, Task
+from mgpo_jax.network_configs import TransformerConfig
 from mgpo_jax.sharding import mesh_of_all, on_devices
-from mgpo_jax.transformer import TransformerConfig
 
 # Largest total size of the agents' memories (key-value caches) in a group, in bytes: what fits into the
 # cache of a CPU core, or into the memory of an accelerator.

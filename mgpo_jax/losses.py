@@ -13,8 +13,9 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from envs.base import Trajectory
 from mgpo_jax.kinds import Learned
+from mgpo_jax.network_configs import NetworkConfig, TransformerConfig
 from mgpo_jax.prompts import hindsight_outcome, sample_prompt, single_goal
-from mgpo_jax.transformer import GoalTransformer, NetworkConfig, TransformerConfig
+from mgpo_jax.transformer import GoalTransformer
 
 HIT = 0.1  # per-dimension tolerance for counting a predicted action as correct
 

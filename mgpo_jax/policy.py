@@ -8,13 +8,9 @@ from typing import Any, NamedTuple
 
 from envs.base import EnvSpec
 from envs.errors import DataError
+from mgpo_jax.network_configs import NetworkConfig, TransformerConfig
 from mgpo_jax.seen_goals import SeenGoals
-from mgpo_jax.transformer import (
-    GoalTransformer,
-    NetworkConfig,
-    TransformerConfig,
-    grow_cache,
-)
+from mgpo_jax.transformer import GoalTransformer, grow_cache
 
 
 class Policy(NamedTuple):
@@ -38,7 +34,7 @@ class LoadedPolicy(NamedTuple):
     """A trained network with its parameters and its provenance."""
 
     config: Any
-    """The network's config, a ``transformer.NetworkConfig``; a ``TransformerConfig`` for multi-goal
+    """The network's config, a ``network_configs.NetworkConfig``; a ``TransformerConfig`` for multi-goal
     policies."""
     params: Any
     """The network's parameters, a Flax pytree."""

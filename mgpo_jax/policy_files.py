@@ -40,12 +40,12 @@ from mgpo_jax.files import (
     write_json,
 )
 from mgpo_jax.kinds import KINDS, MULTI_GOAL, kind_of
+from mgpo_jax.network_configs import NetworkConfig, TransformerConfig
 from mgpo_jax.policy import LoadedPolicy, check_fits
 from mgpo_jax.released import released_folder
 from mgpo_jax.schema import STRICT, Json, Name, Sha256, checked_entry, read_document
 from mgpo_jax.seen_goals import MOST_KEPT, SeenGoals
 from mgpo_jax.settings import ENCODERS, Index
-from mgpo_jax.transformer import NetworkConfig, TransformerConfig
 
 FORMAT = 2  # version 1 had flat observations of size obs_dim
 WEIGHTS = "weights.npz"

@@ -27,6 +27,7 @@ from mgpo_jax import processes
 from mgpo_jax.dataset import BatchPlan, Dataset, check_dataset, plan_batches
 from mgpo_jax.kinds import kind_of
 from mgpo_jax.losses import Stats, batch_loss
+from mgpo_jax.network_configs import NetworkConfig, TransformerConfig, network_config
 from mgpo_jax.policy import LoadedPolicy, check_fits
 from mgpo_jax.progress import Progress
 from mgpo_jax.seen_goals import seen_in
@@ -41,7 +42,6 @@ from mgpo_jax.sharding import (
     split,
     spread,
 )
-from mgpo_jax.transformer import NetworkConfig, TransformerConfig, network_config
 from mgpo_jax.weight_updates import make_optimizer
 
 # Entries of a step's metrics that are not reported: whether all weights are finite, and how many processes

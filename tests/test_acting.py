@@ -14,11 +14,12 @@ from envs.errors import UsageError
 from envs.maze.env import MazeRunner
 from mgpo_jax.acting import Actor
 from mgpo_jax.judging import play
+from mgpo_jax.network_configs import network_config
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.prompts import Prompt, goals_of, prompt_of
 from mgpo_jax.rollout import Query
 from mgpo_jax.tasks import sample_tasks, task_at
-from mgpo_jax.transformer import GoalTransformer, network_config
+from mgpo_jax.transformer import GoalTransformer
 
 ENV = MazeRunner(name="tiny", side=7, horizon=20)
 STEP = jax.jit(ENV.step)

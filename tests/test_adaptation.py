@@ -16,12 +16,13 @@ from envs.episodes import replay, run_episode
 from envs.gridworld.env import GridWorld
 from envs.maze.env import MazeRunner
 from mgpo_jax.adaptation import Adapter, proceed, search, start
+from mgpo_jax.network_configs import TransformerConfig
 from mgpo_jax.optimizers import SearchSpace, ucb
 from mgpo_jax.optimizers.methods import prompt_adapter
 from mgpo_jax.policy import transformer_policy
 from mgpo_jax.prompts import Prompt
 from mgpo_jax.rollout import Query, rollout
-from mgpo_jax.transformer import GoalTransformer, TransformerConfig
+from mgpo_jax.transformer import GoalTransformer
 
 NUM_EPISODES = 7
 KEY = jax.random.split(jax.random.key(3), 16)[0]

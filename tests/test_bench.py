@@ -18,7 +18,7 @@ from experiments.bench import BenchConfig, main
 from experiments.measurements import sequence_flops
 from experiments.store.presets import pretrain_preset
 from mgpo_jax.kinds import kind_of
-from mgpo_jax.transformer import TransformerConfig
+from mgpo_jax.network_configs import TransformerConfig
 
 CONFIG = TransformerConfig(obs_shape=(3, 2), goal_dim=2, action_dim=4, horizon=9, embed_dim=8)
 

@@ -26,10 +26,11 @@ from mgpo_jax.checkpoint import (
     restore_state,
     save_state,
 )
+from mgpo_jax.network_configs import TransformerConfig, network_config
 from mgpo_jax.prompts import single_goal
 from mgpo_jax.settings import TrainConfig
 from mgpo_jax.training import TrainState
-from mgpo_jax.transformer import GoalTransformer, TransformerConfig, network_config
+from mgpo_jax.transformer import GoalTransformer
 from mgpo_jax.weight_updates import make_optimizer
 
 SPEC = envs.make("maze15").spec

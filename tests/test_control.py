@@ -32,8 +32,8 @@ from mgpo_jax.baselines.spirl import Kept as KeptLatent
 from mgpo_jax.baselines.spirl import Spirl
 from mgpo_jax.losses import initial_params
 from mgpo_jax.methods import Setting
+from mgpo_jax.network_configs import network_config, world_side
 from mgpo_jax.policy import LoadedPolicy
-from mgpo_jax.transformer import network_config, world_side
 
 pytestmark = pytest.mark.slow
 ENV = envs.make("gridworld")  # lends its spec to networks that are never run

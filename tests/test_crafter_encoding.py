@@ -28,10 +28,11 @@ from envs.crafter.view import (
     OBS_SIZE,
     POSSIBLE,
 )
+from mgpo_jax.network_configs import network_config
 from mgpo_jax.policy import LoadedPolicy, transformer_policy
 from mgpo_jax.prompts import Prompt, single_goal
 from mgpo_jax.settings import ENCODERS
-from mgpo_jax.transformer import GoalTransformer, network_config
+from mgpo_jax.transformer import GoalTransformer
 
 WIDTH = 5
 

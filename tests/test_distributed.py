@@ -26,9 +26,9 @@ from test_own_training import make_data
 from mgpo_jax import save_dataset
 from mgpo_jax.encoders import LINEAR  # noqa: F401 (its module is needed before a network is made)
 from mgpo_jax.losses import initial_params
+from mgpo_jax.network_configs import network_config
 from mgpo_jax.policy_files import save_policy
 from mgpo_jax.settings import RECIPE_NETWORK
-from mgpo_jax.transformer import network_config
 
 ROOT = Path(__file__).parents[1]
 LIMIT = 120  # seconds, after which a process is killed

@@ -26,9 +26,10 @@ from experiments.store.policies import check_weights
 from experiments.store.result_files import save_results
 from experiments.store.results import Results
 from experiments.store.summary import summarize
+from mgpo_jax.network_configs import network_config
 from mgpo_jax.policy_files import read_policy, save_policy
 from mgpo_jax.prompts import prompt_of, single_goal
-from mgpo_jax.transformer import GoalTransformer, network_config
+from mgpo_jax.transformer import GoalTransformer
 
 SHORT_GRID = replace(
     GRIDWORLD, name="short", make=lambda: GridWorld(name="short", horizon=12), policy_of=None

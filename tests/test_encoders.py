@@ -17,6 +17,7 @@ from envs.maze.env import MazeRunner
 from envs.wrappers import Noisy, Wrapper
 from mgpo_jax.dataset import BatchPlan, Dataset, load_dataset, save_dataset
 from mgpo_jax.losses import bc_loss
+from mgpo_jax.network_configs import TransformerConfig, network_config
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.prompts import Prompt
 from mgpo_jax.runner import adapt
@@ -24,7 +25,7 @@ from mgpo_jax.settings import ENCODERS, TrainConfig
 from mgpo_jax.sharding import device_mesh
 from mgpo_jax.tasks import sample_tasks
 from mgpo_jax.training import Trainer, batch_stream
-from mgpo_jax.transformer import GoalTransformer, TransformerConfig, grow_cache, network_config
+from mgpo_jax.transformer import GoalTransformer, grow_cache
 
 HORIZON, NUM_SLOTS = 6, 3
 PICTURES = TransformerConfig(

@@ -12,13 +12,13 @@ import pytest
 from envs.maze.demonstrators import maze_demonstrators
 from envs.maze.env import MazeRunner
 from experiments.datasets import collect
+from mgpo_jax.network_configs import network_config
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.runner import adapt
 from mgpo_jax.settings import TrainConfig
 from mgpo_jax.sharding import device_mesh
 from mgpo_jax.tasks import sample_tasks
 from mgpo_jax.training import Trainer, batch_stream
-from mgpo_jax.transformer import network_config
 
 ENV = MazeRunner(name="maze9", side=9, horizon=24)
 

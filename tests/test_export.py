@@ -100,9 +100,10 @@ def test_other_networks_are_those_of_jax(change: dict[str, Any]) -> None:
     import jax
     import jax.numpy as jnp
 
+    from mgpo_jax.network_configs import network_config
     from mgpo_jax.policy import LoadedPolicy
     from mgpo_jax.prompts import Prompt
-    from mgpo_jax.transformer import GoalTransformer, network_config
+    from mgpo_jax.transformer import GoalTransformer
 
     spec = envs.make("maze15").spec
     config = network_config(

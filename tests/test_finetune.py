@@ -38,12 +38,13 @@ from mgpo_jax.baselines.returns import advantages, returns_to_go
 from mgpo_jax.baselines.subsets import subset
 from mgpo_jax.distributions import HEADS
 from mgpo_jax.methods import Setting, with_numbers
+from mgpo_jax.network_configs import network_config
 from mgpo_jax.optimizers.base import PromptOptimizer
 from mgpo_jax.optimizers.methods import fixed_prompt, prompt_adapter
 from mgpo_jax.policy import transformer_policy
 from mgpo_jax.prompts import single_goal
 from mgpo_jax.rollout import Query
-from mgpo_jax.transformer import GoalTransformer, network_config
+from mgpo_jax.transformer import GoalTransformer
 
 NUM_STATES = 5
 

@@ -23,8 +23,9 @@ import envs
 import mgpo_jax
 from experiments import runtime
 from mgpo_jax.methods import METHODS
+from mgpo_jax.network_configs import network_config
 from mgpo_jax.prompts import single_goal
-from mgpo_jax.transformer import GoalTransformer, network_config
+from mgpo_jax.transformer import GoalTransformer
 
 FINAL = "final (mean ± std over seeds)"
 GUIDES = Path(__file__).parents[1] / "docs" / "guides"

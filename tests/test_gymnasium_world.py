@@ -26,8 +26,9 @@ from envs.errors import DataError, NotAvailableError, UsageError
 from envs.gymnasium_world import GymnasiumWorld
 from envs.live import Pool, Start
 from experiments import runtime
+from mgpo_jax.network_configs import network_config
 from mgpo_jax.prompts import single_goal
-from mgpo_jax.transformer import GoalTransformer, network_config
+from mgpo_jax.transformer import GoalTransformer
 
 
 def fresh(described: GymnasiumWorld, **changes) -> GymnasiumWorld:

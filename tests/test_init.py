@@ -30,11 +30,11 @@ from experiments.store.runs import begin, check_start, has_begun, identity
 from experiments.store.settings import DEFAULT_WORLD, PretrainConfig, training_settings
 from mgpo_jax import Dataset, LoadedPolicy, TrainConfig, pretrain
 from mgpo_jax.files import hash_file
+from mgpo_jax.network_configs import network_config
 from mgpo_jax.policy_files import read_policy, save_policy
 from mgpo_jax.settings import check_contradictions
 from mgpo_jax.sharding import device_mesh
 from mgpo_jax.training import Trainer, continued_network
-from mgpo_jax.transformer import network_config
 
 PRETRAINED = Path(__file__).parents[1] / "mgpo_jax/pretrained"
 Run = Callable[..., tuple[int, str]]

@@ -19,12 +19,12 @@ from mgpo_jax import methods
 from mgpo_jax.baselines.commanded import CommandConfig
 from mgpo_jax.baselines.skills import SkillConfig
 from mgpo_jax.kinds import KINDS, MULTI_GOAL, kind_of
+from mgpo_jax.network_configs import TransformerConfig, world_side
 from mgpo_jax.policy_files import load_policy, read_policy, save_policy
 from mgpo_jax.released import released_folder
 from mgpo_jax.settings import TrainConfig
 from mgpo_jax.sharding import device_mesh
 from mgpo_jax.training import Trainer, batch_stream
-from mgpo_jax.transformer import TransformerConfig, world_side
 
 SPEC = EnvSpec(
     name="tiny",

@@ -36,6 +36,7 @@ from mgpo_jax.methods import (
     UcbHyper,
     split_hyper,
 )
+from mgpo_jax.network_configs import network_config
 from mgpo_jax.optimizers import methods as factories
 from mgpo_jax.optimizers.base import SearchSpace
 from mgpo_jax.optimizers.methods import search_space
@@ -46,7 +47,7 @@ from mgpo_jax.prompts import Prompt
 from mgpo_jax.runner import adapt, sweep
 from mgpo_jax.settings import Count, static
 from mgpo_jax.tasks import sample_tasks
-from mgpo_jax.transformer import GoalTransformer, network_config
+from mgpo_jax.transformer import GoalTransformer
 
 ROOT = Path(__file__).parents[1]
 ENV = MazeRunner(name="tiny", side=7, horizon=6)

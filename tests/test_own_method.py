@@ -20,10 +20,11 @@ from own_world import Line
 import mgpo_jax
 from experiments import runtime
 from experiments.store.result_files import load_results
+from mgpo_jax.network_configs import network_config
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.prompts import single_goal
 from mgpo_jax.tasks import sample_tasks
-from mgpo_jax.transformer import GoalTransformer, network_config
+from mgpo_jax.transformer import GoalTransformer
 
 
 class Done(NamedTuple):

@@ -17,12 +17,13 @@ import pytest
 import envs
 from envs.base import ArraySpec, Box, ObsLayout
 from envs.errors import DataError, UsageError
+from mgpo_jax.network_configs import TransformerConfig, network_config
 from mgpo_jax.policy_files import load_policy, read_policy, save_policy
 from mgpo_jax.prompts import single_goal
 from mgpo_jax.released import released_folder
 from mgpo_jax.rollout import Query, rollout
 from mgpo_jax.tasks import load_tasks
-from mgpo_jax.transformer import GoalTransformer, TransformerConfig, network_config
+from mgpo_jax.transformer import GoalTransformer
 
 SPEC = envs.make("maze15").spec
 CONFIG = network_config(SPEC, embed_dim=8, num_layers=1)

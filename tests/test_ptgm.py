@@ -40,8 +40,9 @@ from mgpo_jax.baselines.hierarchy import (
 from mgpo_jax.baselines.methods import PtgmGoalHyper, PtgmHyper
 from mgpo_jax.baselines.ptgm import Choice, Kept, Ptgm, greedy_divergence, targets
 from mgpo_jax.methods import Setting
+from mgpo_jax.network_configs import world_side
 from mgpo_jax.policy import LoadedPolicy
-from mgpo_jax.transformer import grow_cache, world_side
+from mgpo_jax.transformer import grow_cache
 
 ENV = envs.make("gridworld")
 T = 8

@@ -18,10 +18,11 @@ from experiments.release import command
 from experiments.store.cards import cpu_minutes
 from experiments.store.settings import PretrainConfig
 from mgpo_jax.files import to_json
+from mgpo_jax.network_configs import network_config
 from mgpo_jax.policy_files import load_policy, save_policy
 from mgpo_jax.prompts import single_goal
 from mgpo_jax.tasks import load_tasks, num_tasks
-from mgpo_jax.transformer import GoalTransformer, network_config
+from mgpo_jax.transformer import GoalTransformer
 
 ROW = {
     "train/loss": 1.5, "val/loss": 1.6, "val/accuracy": 0.4, "eval/initial_return": 0.1,

@@ -30,13 +30,14 @@ from experiments.store.summary import read_summary, summarize
 from experiments.store.summary_text import printed
 from mgpo_jax.kinds import MULTI_GOAL
 from mgpo_jax.methods import BbtHyper, policy_kind
+from mgpo_jax.network_configs import network_config
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.policy_files import read_policy, save_policy
 from mgpo_jax.prompts import single_goal
 from mgpo_jax.runner import adapt
 from mgpo_jax.settings import check_settings
 from mgpo_jax.tasks import sample_tasks, task_at
-from mgpo_jax.transformer import GoalTransformer, network_config
+from mgpo_jax.transformer import GoalTransformer
 
 PUBLISHED = sorted((Path(__file__).parents[1] / "results").glob("*/*/results.npz"))
 GRID = World(name="short", make=lambda: GridWorld(name="short", horizon=60))

@@ -15,10 +15,11 @@ from envs.base import Agent
 from envs.episodes import run_episode
 from envs.maze.env import EAST, NORTH, STAY, WEST, MazeRunner, MazeTask
 from envs.wrappers import Wrapper
+from mgpo_jax.network_configs import TransformerConfig
 from mgpo_jax.policy import transformer_policy
 from mgpo_jax.prompts import Prompt
 from mgpo_jax.rollout import Query, prompted, rollout
-from mgpo_jax.transformer import GoalTransformer, TransformerConfig
+from mgpo_jax.transformer import GoalTransformer
 
 ENV = MazeRunner(name="tiny", side=7, horizon=12)
 DRAWING = """

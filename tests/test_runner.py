@@ -23,13 +23,14 @@ from mgpo_jax.distributions import Categorical
 from mgpo_jax.judging import evaluate, evaluate_fully, play, uncertainty
 from mgpo_jax.lanes import cache_bytes, lanes_together, lay_out
 from mgpo_jax.methods import GCBC, UCB, Method, NoHyper, UcbHyper
+from mgpo_jax.network_configs import network_config
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.prompts import Prompt, single_goal
 from mgpo_jax.rollout import Query, rollout
 from mgpo_jax.runner import adapt, sweep
 from mgpo_jax.settings import NotNegative
 from mgpo_jax.tasks import sample_tasks, task_at
-from mgpo_jax.transformer import GoalTransformer, network_config
+from mgpo_jax.transformer import GoalTransformer
 
 MAZE = MazeRunner(name="tiny", side=7, horizon=10)
 GRID = GridWorld(name="tiny", horizon=20)

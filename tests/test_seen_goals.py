@@ -31,6 +31,7 @@ from experiments.store.result_files import load_results
 from experiments.store.rows import read_row
 from mgpo_jax import tasks as tasks_of
 from mgpo_jax.dataset import Dataset
+from mgpo_jax.network_configs import network_config
 from mgpo_jax.policy_files import (
     load_policy,
     read_policy,
@@ -48,7 +49,7 @@ from mgpo_jax.seen_goals import (
     warning_of_goals,
     warning_of_prompts,
 )
-from mgpo_jax.transformer import GoalTransformer, network_config
+from mgpo_jax.transformer import GoalTransformer
 
 ROOT = Path(__file__).parents[1]
 CONFIG = network_config(envs.make("maze15").spec, embed_dim=8, num_layers=1)

@@ -34,7 +34,7 @@ from mgpo_jax.baselines.skills import (
 )
 from mgpo_jax.baselines.spirl import Kept, Spirl
 from mgpo_jax.methods import Setting
-from mgpo_jax.transformer import world_side
+from mgpo_jax.network_configs import world_side
 
 ENV = envs.make("gridworld")
 K, T = 3, 8

@@ -18,11 +18,12 @@ from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.result_files import load_results
 from experiments.sweeping import variants
 from mgpo_jax import runner
+from mgpo_jax.network_configs import network_config
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.policy_files import save_policy
 from mgpo_jax.prompts import single_goal
 from mgpo_jax.tasks import save_tasks
-from mgpo_jax.transformer import GoalTransformer, network_config
+from mgpo_jax.transformer import GoalTransformer
 
 
 def config_of(words: str) -> AdaptConfig:

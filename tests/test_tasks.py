@@ -16,6 +16,7 @@ from envs.wrappers import Wrapper
 from experiments import watching
 from experiments.datasets import find_demonstrator
 from experiments.watching import ReturnsOnTheWay
+from mgpo_jax.network_configs import network_config
 from mgpo_jax.optimizers.methods import judged_query
 from mgpo_jax.prompts import single_goal
 from mgpo_jax.released import released_folder
@@ -32,7 +33,7 @@ from mgpo_jax.tasks import (
 from mgpo_jax.tasks import (
     test_tasks as tasks_to_test,  # pytest would take it for a test
 )
-from mgpo_jax.transformer import GoalTransformer, network_config
+from mgpo_jax.transformer import GoalTransformer
 
 NUM = 50
 GREEDY = Judgement()

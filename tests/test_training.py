@@ -17,11 +17,12 @@ from envs.errors import UsageError
 from mgpo_jax.dataset import BatchPlan, Dataset
 from mgpo_jax.distributions import Gaussian
 from mgpo_jax.losses import bc_loss, blurred, stats_of
+from mgpo_jax.network_configs import TransformerConfig
 from mgpo_jax.prompts import hindsight_outcome, sample_prompt
 from mgpo_jax.settings import TrainConfig
 from mgpo_jax.sharding import device_mesh
 from mgpo_jax.training import Trainer, TrainState, batch_stream
-from mgpo_jax.transformer import GoalTransformer, TransformerConfig
+from mgpo_jax.transformer import GoalTransformer
 from mgpo_jax.weight_updates import learning_rate_schedule, make_optimizer
 
 HORIZON = 6

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 import mgpo_jax.transformer
+from mgpo_jax.network_configs import TransformerConfig
 from mgpo_jax.prompts import Prompt
-from mgpo_jax.transformer import GoalTransformer, TransformerConfig, grow_cache
+from mgpo_jax.transformer import GoalTransformer, grow_cache
 
 T, P = 8, 3
 CONFIG = TransformerConfig(

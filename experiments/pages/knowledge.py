@@ -19,10 +19,10 @@ from experiments.store.layout import CONFIG
 from experiments.store.results import Results
 from mgpo_jax.adaptation import Adapter
 from mgpo_jax.methods import METHODS, Setting
+from mgpo_jax.network_configs import network_config
 from mgpo_jax.optimizers.arms import Arms
 from mgpo_jax.prompts import Prompt
 from mgpo_jax.rollout import Query
-from mgpo_jax.transformer import network_config
 
 NO_ARM = 255  # stands for an episode that changed no arm; a table has at most 64 rows
 

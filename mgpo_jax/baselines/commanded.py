@@ -27,11 +27,12 @@ from mgpo_jax.baselines.hierarchy import LowLevel, hierarchical
 from mgpo_jax.distributions import Distribution
 from mgpo_jax.kinds import Learned
 from mgpo_jax.losses import Stats, blurred, stats_of, transformer_told
+from mgpo_jax.network_configs import TransformerConfig
 from mgpo_jax.prompts import Prompt
 from mgpo_jax.rollout import act
 from mgpo_jax.schema import STRICT
 from mgpo_jax.settings import Count, Share
-from mgpo_jax.transformer import GoalTransformer, KVCache, TransformerConfig, grow_cache
+from mgpo_jax.transformer import GoalTransformer, KVCache, grow_cache
 
 Number = Annotated[float, Ge(-1e18), Le(1e18)]
 

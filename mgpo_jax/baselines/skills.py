@@ -31,10 +31,10 @@ from mgpo_jax.baselines.hierarchy import LowLevel, Mlp, hierarchical
 from mgpo_jax.distributions import HEADS, Distribution
 from mgpo_jax.kinds import Learned
 from mgpo_jax.losses import Stats, blurred, stats_of
+from mgpo_jax.network_configs import NetworkConfig
 from mgpo_jax.rollout import act
 from mgpo_jax.schema import STRICT
 from mgpo_jax.settings import NotNegative, NumLayers, Width
-from mgpo_jax.transformer import NetworkConfig
 
 MIN_LOG_STD, MAX_LOG_STD = -10.0, 2.0  # clvrai/spirl
 
