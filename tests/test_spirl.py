@@ -196,14 +196,16 @@ def test_before_the_first_update_the_prior_acts(params):
         np.testing.assert_array_equal(mine.trajectory.actions, other.trajectory.actions)
 
 
-def test_it_explores_in_the_search_and_is_judged_by_the_means(params):
-    agent = spirl(SpirlHyper(), params)
+@pytest.mark.parametrize("judged_by", ["mean", "sample"])
+def test_it_explores_in_the_search_and_is_judged_by_means_or_samples(params, judged_by):
+    agent = spirl(SpirlHyper(judged_by=judged_by), params)
     state = agent.init(jax.random.key(0), jnp.zeros(ENV.spec.goal_dim))
     seen = jax.random.normal(jax.random.key(1), (OPEN.embed_dim,))
     policy, key = agent.policy(state.weights.actor, seen), jax.random.key(2)
     tried, _ = agent.adapter().ask(jax.random.key(3), state)
     judged = agent.adapter().best(state)
-    for choice, wanted in ((tried, policy.sample(key)), (judged, policy.mean)):
+    last = policy.mean if judged_by == "mean" else policy.sample(key)
+    for choice, wanted in ((tried, policy.sample(key)), (judged, last)):
         latent, kept = rule_of(spirl_module, agent, state, choice)(key, seen, None)
         np.testing.assert_array_equal(latent, wanted)
         np.testing.assert_array_equal(kept.latent, latent)

@@ -110,7 +110,7 @@ class Spirl:
             ask=lambda key, state: (Choice(jnp.zeros((), bool)), state),
             agent=self.agent,
             tell=self.tell,
-            best=lambda state: Choice(jnp.ones((), bool)),
+            best=lambda state: Choice(jnp.asarray(self.hyper.judged_by == "mean")),
             tell_in_turn=True,
         )
 
