@@ -21,7 +21,7 @@ def judged(folder: Path, index: int) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(usage=__doc__)
+    parser = argparse.ArgumentParser(usage=(__doc__ or "").replace("%", "%%"))
     parser.add_argument("runs", type=Path, nargs="+")
     other = parser.add_mutually_exclusive_group()
     other.add_argument("--minus", type=Path)
