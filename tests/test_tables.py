@@ -35,6 +35,7 @@ OTHER_SETTINGS = {  # of published results that the paper's number may not stand
     "gridworld/ucb-as-printed": "keep_rewarded=false",
     "ablations/gridworld/without-prior/ptgm": "kl=0",
     "ablations/gridworld/without-prior/ptgm-goal": "kl=0",
+    "ablations/gridworld/spirl-sampled": "judged_by=sample",
     "ablations/kitchen/mixture/ucb": "policy=..",
     "ablations/maze15/behind-noise/plan-action": "action_noise=0.1",
     "ablations/maze15/behind-noise/plan-full": "num_states=48",
