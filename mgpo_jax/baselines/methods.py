@@ -144,8 +144,8 @@ class SpirlHyper:
     """Number of episodes before the first update, in which the prior acts; they count against the
     budget."""
     judged_by: Literal["mean", "sample"] = static("mean")
-    """How latents are chosen when the policy is judged: the mean of its distribution, or a sample, as in the
-    episodes of the search and in ``spirl-prior``."""
+    """How latents are chosen when the policy is judged: the mean of its distribution, or a sample, as
+    in the episodes of the search and in ``spirl-prior``."""
 
 
 _HERE = "mgpo_jax.baselines.finetune"
