@@ -156,7 +156,7 @@ def rate(pixels: bool, num_lanes: int) -> float:
 def length_of(episode: Any) -> Int[Array, ""]:
     """The number of steps of an episode, computed such that it depends on every step of the record."""
     record = episode.trajectory
-    # It reads the last observation, which may be any, so that the compiler does not eliminate them.
+    # Any step may be the last, so the compiler has to keep the observations of all of them.
     return record.length + (jnp.sum(record.obs[record.length - 1].astype(jnp.float32)) < -1.0)
 
 

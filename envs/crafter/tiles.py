@@ -91,7 +91,7 @@ def picture(obs: Float[Array, "O"], unit: int = UNIT) -> UInt8[Array, "height wi
 
     lit = light * _tiled(table.day, cells, unit) + (1 - light) * _tiled(table.night, cells, unit)
     lit = jnp.floor(lit).astype(jnp.int32)
-    # Written out, since XLA computes a sum over three channels, and a division by 2, several times slower.
+    # Written out: with a sum over the channels and a division by 2, drawing takes twice the time on a CPU.
     gray = (lit[..., 0] * GRAY[0] + lit[..., 1] * GRAY[1] + lit[..., 2] * GRAY[2] + 0x8000) >> 16
     local = jnp.where(asleep, (gray[..., None] + SLEEP) >> 1, lit).astype(jnp.uint8)
 
@@ -103,13 +103,13 @@ def picture(obs: Float[Array, "O"], unit: int = UNIT) -> UInt8[Array, "height wi
 
 
 class Strips(NamedTuple):
-    """All tiles as rows of pixels: row ``y`` of tile ``i`` is at ``i u + y``, and has ``u`` pixels."""
+    """All tiles, cut into rows of ``u`` pixels or ``3 u`` numbers; row y of tile i is at ``i u + y``."""
 
-    day: Float[np.ndarray, "rows pixels"]
+    day: Float[np.ndarray, "rows colors"]
     """The tiles of all codes, then those of the agent (facing by facing, block by block)."""
-    night: Float[np.ndarray, "rows pixels"]
+    night: Float[np.ndarray, "rows colors"]
     """The same tiles in the dark."""
-    items: UInt8[np.ndarray, "rows pixels"]
+    items: UInt8[np.ndarray, "rows colors"]
     """The icons of all items (count by count)."""
 
 
@@ -124,14 +124,13 @@ def _strips(unit: int) -> Strips:
 
 
 def _tiled(
-    strips: UInt8[np.ndarray, "rows pixels"] | Float[np.ndarray, "rows pixels"],
+    strips: UInt8[np.ndarray, "rows colors"] | Float[np.ndarray, "rows colors"],
     which: Int[Array, "C"],
     unit: int,
 ) -> UInt8[Array, "height width 3"] | Float[Array, "height width 3"]:
     """Lay out tiles row by row, ``COLUMNS`` in a row.
 
-    The strips are looked up in the order of the picture. Looking up whole tiles and then transposing the
-    picture takes several times longer.
+    The strips are looked up in the order of the picture, so nothing has to be transposed.
     """
     rows = which.reshape(-1, 1, COLUMNS) * unit + jnp.arange(unit)[:, None]
     return jnp.asarray(strips)[rows].reshape(-1, COLUMNS * unit, 3)
