@@ -169,6 +169,7 @@ def proceed(
     max_rounds: int,
     judge_key: PRNGKeyArray | None = None,
     num_judged: int = 0,
+    judging: bool | Bool[Array, ""] = True,
     keep_actions: bool = False,
     stopped: Bool[Array, ""] | None = None,
 ) -> tuple[AdaptState, AdaptLog, Judged]:
@@ -186,12 +187,14 @@ def proceed(
         are meaningless.
       judge_key: random key of the judging episodes (default: none are run).
       num_judged: number of judging episodes (static).
+      judging: whether the judging episodes are run after these rounds (traced).
       keep_actions: whether the log keeps continuous actions, too; discrete actions are always kept.
       stopped: whether the search had already ended. Then its episodes have no steps and its state does not
         change. None, the default, means that no search ends early, and compiles no test for it.
 
     Returns:
-      The new state, the log of the rounds, and the judgement (NaN if no episodes judge).
+      The new state, the log of the rounds, and the judgement. The judgement is NaN if ``num_judged`` is 0,
+      and meaningless if ``judging`` is false.
     """
     judge_keys = None if judge_key is None else jax.random.split(judge_key, num_judged)
 
@@ -208,7 +211,8 @@ def proceed(
         state, row = traced(carry[0], index)
         return state, put_row(carry[1], row, index)
 
-    state, log = jax.lax.fori_loop(0, num_rounds + num_judged, body, (state, blank))
+    num_entries = num_rounds + jnp.where(judging, num_judged, 0)
+    state, log = jax.lax.fori_loop(0, num_entries, body, (state, blank))
     judged = Judged(jnp.float32(jnp.nan), jnp.int32(0))
     if num_judged:
         returns, failed, goals = jax.tree.map(

@@ -65,11 +65,14 @@ class Outcome(NamedTuple):
     for methods that learn from episodes alone."""
 
 
-class Segment(NamedTuple):
-    """The results of a finished segment; all arrays have a leading axis of lanes."""
+class Part(NamedTuple):
+    """The results of a finished part of a segment; all arrays have a leading axis of lanes."""
 
     log: AdaptLog
     judged: Judged
+    """The latest judgement: the one after this part, or the one before it if the part ends no segment."""
+    ends_segment: bool
+    """Whether this is the last part of a segment, after which the best choice was judged."""
     cpu_seconds: float
 
 
@@ -82,7 +85,7 @@ class Record(NamedTuple):
     log: AdaptLog
     judged: Judged
     reached: list[Goals]
-    """The goals of the episodes of each segment, ``[lanes, R, K, T, ..]``."""
+    """The goals of the episodes of each part, ``[lanes, R, K, T, ..]``."""
 
     def outcome(
         self, variant: int, grid: Grid, after: np.ndarray, num_episodes: int, cpu_seconds: float
@@ -128,15 +131,15 @@ def without_goals(log: AdaptLog) -> AdaptLog:
     return log._replace(played=log.played._replace(goals=nothing))
 
 
-def reached_in(segments: Sequence[Goals]) -> Reached:
-    """The goals reached in the episodes of consecutive segments, ``[S, N, E, T, ..]`` each."""
+def reached_in(parts: Sequence[Goals]) -> Reached:
+    """The goals reached in the episodes of consecutive parts, ``[S, N, E, T, ..]`` each."""
     real = [
         goals.goal_reached & (np.arange(goals.goal_reached.shape[-1]) < goals.length[..., None])
-        for goals in segments
+        for goals in parts
     ]
     counts = np.concatenate([which.sum(axis=-1) for which in real], axis=2)
     reached = np.concatenate(real, axis=2)
     steps = np.nonzero(reached)[-1]
-    achieved = np.concatenate([goals.achieved_goals for goals in segments], axis=2)
+    achieved = np.concatenate([goals.achieved_goals for goals in parts], axis=2)
     small = np.min_scalar_type(reached.shape[-1])
     return Reached(counts.astype(np.int32), steps.astype(small), achieved[reached])

@@ -24,13 +24,13 @@ def ended(judged: Sequence[Judged], stop_at: float) -> np.ndarray:
 def filled(
     log: AdaptLog, judged: Judged, stopped: np.ndarray, before: Sequence[tuple[AdaptLog, Judged]]
 ) -> tuple[AdaptLog, Judged]:
-    """Fill in the results of stopped lanes in a segment.
+    """Fill in the results of stopped lanes in a part of a segment.
 
     Args:
-      log: the log of the segment, rows of L lanes.
-      judged: the judgement after the segment.
+      log: the log of the part, rows of L lanes.
+      judged: the judgement after the part.
       stopped: which searches had ended before the segment, [L].
-      before: logs and judgements of the earlier segments, of which the first has only a judgement.
+      before: logs and judgements of the earlier parts, of which the first has only a judgement.
 
     Returns:
       The log and the judgement. In the rows of stopped lanes, returns are the best one of any earlier

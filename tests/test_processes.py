@@ -21,7 +21,7 @@ from envs.errors import UsageError
 from experiments import joining, signals
 from experiments.datasets import _as_one
 from experiments.joining import Joined, check_flags
-from mgpo_jax import lanes, processes, runner, sharding
+from mgpo_jax import lanes, processes, programs, segments, sharding
 from mgpo_jax.methods import UCB
 from mgpo_jax.processes import DisagreementError, Door, Member, Team, connected
 from mgpo_jax.runner import sweep
@@ -223,16 +223,16 @@ def test_no_collective_joins_devices_of_one_process(monkeypatch: pytest.MonkeyPa
         return run
 
     monkeypatch.setattr("mgpo_jax.training.on_devices", on_devices)
-    for module in (lanes, runner):
+    for module in (lanes, segments):
         monkeypatch.setattr(module, "on_devices", on_devices)
     trainer = Trainer(CONFIG, NETWORK, DATASET, sharding.device_mesh(2))
     trainer.step(trainer.init(), parts_of(4))
     assert len(compiled) == 4  # to unpack, to add for each of two parts, to pack
-    for function in (runner._program, runner._breaking):
+    for function in (programs.programs_of, segments._breaking):
         function.cache_clear()
     env = Point()
     sweep(env, untrained(env), tasks_of(env), UCB, [UCB.hyper()], seeds=1, episodes=2, eval_every=2)
-    for function in (runner._program, runner._breaking):
+    for function in (programs.programs_of, segments._breaking):
         function.cache_clear()
     assert len(compiled) > 6
     assert [text for text in compiled if COLLECTIVE.search(text)] == []

@@ -37,7 +37,7 @@ from experiments.measurements import bench_gradient_step
 from experiments.networks import configured_network
 from experiments.runtime import configure
 from experiments.store.presets import pretrain_preset
-from mgpo_jax import runner
+from mgpo_jax import programs, runner
 from mgpo_jax.policy_files import load_policy
 from mgpo_jax.tasks import test_tasks
 
@@ -99,16 +99,16 @@ def adapt(
     policy = load_policy(record)
     some = jax.tree.map(lambda leaf: leaf[:tasks], test_tasks(record))
     compiled: list[float] = []
-    compile_program = runner.Program.compile
+    compile_program = programs.Program.compile
 
-    def timed(program: runner.Program, *args: Any) -> Any:
+    def timed(program: programs.Program, *args: Any) -> Any:
         start = time.perf_counter()
         found = compile_program(program, *args)
         compiled.append(time.perf_counter() - start)
         return found
 
     with (
-        mock.patch.object(runner.Program, "compile", timed),
+        mock.patch.object(programs.Program, "compile", timed),
         mock.patch.object(envs.episodes, "MAX_SEGMENTS", segments),
         wall_time(),
     ):
