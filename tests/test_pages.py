@@ -39,6 +39,7 @@ from experiments.store.results import Results
 from experiments.store.rows import read_row
 from experiments.store.seals import is_sealed
 from experiments.store.summary import summarize
+from mgpo_jax.methods import METHODS, Method
 from mgpo_jax.policy_files import load_policy
 
 ROOT = Path(__file__).parents[1]
@@ -408,6 +409,28 @@ def test_methods_without_arms_and_older_settings_have_none(result: Path) -> None
     assert knowledge_of(load_results(result)) is None  # no hyper-parameters on record
     for method in ("bbt", "grips"):
         assert knowledge_of(few_tasks(load_results(ROOT / "results/maze15" / method), 1)) is None
+
+
+def test_a_method_that_needs_weights_is_named(
+    result: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The page says why it does not show what the method knew, and shows everything else."""
+
+    def make(setting: Any, params: Any, hyper: Any) -> Any:
+        return params["weights"]
+
+    method = Method(name="hungry", make=make, summary="needs weights")
+    monkeypatch.setitem(METHODS._registered, "hungry", method)
+    settings = {**config_of("tiny", "hungry"), "hyper": {}}
+    (result / "config.json").write_text(json.dumps(settings))
+    summary = json.loads((result / "summary.json").read_text())
+    (result / "summary.json").write_text(
+        json.dumps({**summary, "method": "hungry", "optimizer": "hungry"})
+    )
+    (run,) = data_of(report([result]))["runs"]
+    assert "what hungry knew cannot be shown" in run["note"]
+    assert "TypeError: 'NoneType' object is not subscriptable" in run["note"]
+    assert "returns" in unpacked(run["arrays"])
 
 
 def test_a_report_of_15_000_episodes_is_small() -> None:

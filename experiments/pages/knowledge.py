@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from pydantic import ValidationError
 
 from envs.base import EnvSpec, Episode, Trajectory
-from envs.errors import DataError
+from envs.errors import DataError, UsageError
 from experiments.store.layout import CONFIG
 from experiments.store.results import Results
 from mgpo_jax.adaptation import Adapter
@@ -94,7 +95,10 @@ def told_adapter(results: Results) -> tuple[Adapter, Any] | None:
 
     Returns:
       The adapter and the shapes of its state; None for a method without prompts, with several episodes per
-      round, or that cannot be made from these settings.
+      round, or whose settings are those of an older version.
+
+    Raises:
+      DataError: if the adapter cannot be made without weights.
     """
     config = results.config
     slots = results.choices["prompt.mask"].shape[-1] if "prompt.mask" in results.choices else 0
@@ -112,10 +116,16 @@ def told_adapter(results: Results) -> tuple[Adapter, Any] | None:
             judged=results.world.judged,
         )
         method.check_use(setting, hyper)
-        adapter = method.adapter(setting, None, hyper)  # without weights, since it never acts
-        state = jax.eval_shape(adapter.init, jax.random.key(0), jnp.zeros(env.spec.goal_dim))
-    except Exception:  # a user's method that needs weights, or settings of an older version
+    except (DataError, UsageError, ValidationError):  # settings of an older version
         return None
+    try:
+        adapter = method.adapter(setting, None, hyper)
+        state = jax.eval_shape(adapter.init, jax.random.key(0), jnp.zeros(env.spec.goal_dim))
+    except Exception as error:  # a user's method may raise anything
+        raise DataError(
+            f"what {method.name} knew cannot be shown, since it cannot be made without weights: "
+            f"{type(error).__name__}: {error}"
+        ) from error
     return (adapter, state) if adapter.episodes_per_round == 1 else None
 
 
