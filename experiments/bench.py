@@ -63,7 +63,7 @@ def main(config: BenchConfig) -> None:
         show_layouts(config)
         return
     join(config)
-    from experiments.datasets import find_demonstrator
+    from experiments.demonstrators import find_demonstrator
     from experiments.measurements import measurements
     from experiments.store.provenance import provenance
     from experiments.store.tables import aligned

@@ -16,7 +16,7 @@ from envs.base import Environment, Episode, Task
 from envs.episodes import run_episode
 from envs.errors import UsageError, printable
 from envs.registry import WORLDS, World
-from experiments.datasets import find_demonstrator
+from experiments.demonstrators import find_demonstrator
 from experiments.drawing import write
 from experiments.figures import Glance, at_a_glance, later, look_of
 from experiments.store.reproduce_settings import ReproduceConfig

@@ -21,7 +21,8 @@ from envs.base import Environment, Episode, State, Task, TimeStep
 from envs.errors import UsageError
 from envs.registry import World
 from envs.wrappers import Wrapper
-from experiments.datasets import collect, find_demonstrator
+from experiments.datasets import collect
+from experiments.demonstrators import find_demonstrator
 from experiments.networks import configured_network
 from experiments.store.presets import pretrain_preset
 from experiments.store.settings import PretrainConfig

@@ -16,7 +16,7 @@ from jaxtyping import Array
 
 import envs
 from envs.base import Environment
-from experiments.datasets import find_demonstrator
+from experiments.demonstrators import find_demonstrator
 from experiments.figures import training_curve
 from experiments.networks import configured_network, initial_policy
 from experiments.runtime import expect_compiling

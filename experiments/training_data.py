@@ -13,7 +13,8 @@ import envs
 from envs.base import Environment
 from envs.errors import DataError, UsageError
 from envs.registry import World
-from experiments.datasets import collect_and_save, find_demonstrator
+from experiments.datasets import collect_and_save
+from experiments.demonstrators import find_demonstrator
 from experiments.store.settings import CollectConfig, PretrainConfig, dataset_folder
 from experiments.store.work import PIECES
 from mgpo_jax import processes

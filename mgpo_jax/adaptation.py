@@ -189,12 +189,11 @@ def proceed(
       num_judged: number of judging episodes (static).
       judging: whether the judging episodes are run after these rounds (traced).
       keep_actions: whether the log keeps continuous actions, too; discrete actions are always kept.
-      stopped: whether the search had already ended. Then its episodes have no steps and its state does not
-        change. None, the default, means that no search ends early, and compiles no test for it.
+      stopped: whether the search had already ended, so that its episodes have no steps and its state does
+        not change; None, the default, compiles no test for it.
 
     Returns:
-      The new state, the log of the rounds, and the judgement. The judgement is NaN if ``num_judged`` is 0,
-      and meaningless if ``judging`` is false.
+      The new state, the log, and the judgement (NaN if no episodes judge, meaningless if not ``judging``).
     """
     judge_keys = None if judge_key is None else jax.random.split(judge_key, num_judged)
 
@@ -203,9 +202,8 @@ def proceed(
         own_key = None if judge_keys is None else judge_keys[jnp.maximum(index - num_rounds, 0)]
         return _round(state, env, adapter, task, searching, own_key, keep_actions, stopped)
 
-    traced, (_, shapes) = traced_once(entry, state, jnp.int32(0))
-    size = max_rounds + num_judged
-    blank = jax.tree.map(lambda leaf: _zeros((size, *leaf.shape), leaf.dtype), shapes)
+    traced, (_, row) = traced_once(entry, state, jnp.int32(0))
+    blank = _blank_rows(max_rounds + num_judged, row)
 
     def body(index: Array, carry: tuple[AdaptState, AdaptLog]) -> tuple[AdaptState, AdaptLog]:
         state, row = traced(carry[0], index)
@@ -329,7 +327,7 @@ def _episodes(
         only = run_episode(keys[0], env, agent, task)
         return jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], only)
     shapes = jax.eval_shape(lambda: run_episode(keys[0], env, agent, task))
-    blank = jax.tree.map(lambda leaf: _zeros((len(keys), *leaf.shape), leaf.dtype), shapes)
+    blank = _blank_rows(len(keys), shapes)
 
     def body(index: Array, rows: Episode) -> Episode:
         return put_row(rows, run_episode(keys[index], env, agent, task), index)
@@ -349,6 +347,11 @@ def small_actions(spec: EnvSpec, episodes: Episode) -> Array:
     dtype = jnp.uint8 if spec.action_dim <= 255 else jnp.uint16
     real = jnp.arange(actions.shape[-1]) < episodes.trajectory.length[..., None]
     return jnp.where(real, actions, jnp.iinfo(dtype).max).astype(dtype)
+
+
+def _blank_rows(num: int, shapes: Any) -> Any:
+    """``num`` rows of zeros for each of the ``shapes``."""
+    return jax.tree.map(lambda leaf: _zeros((num, *leaf.shape), leaf.dtype), shapes)
 
 
 def _zeros(shape: tuple[int, ...], dtype: Any) -> Array:

@@ -139,13 +139,11 @@ def sweep(
     _check_room(env, grid, episodes)
     begin()
     layout = lay_out(env, grid.size, _memory_bytes(env, adapter, tasks))
-    most = longest_part(segments)
-    programs = programs_of(method, setting, fixed, layout, most, keep_actions)
+    programs = programs_of(method, setting, fixed, layout, longest_part(segments), keep_actions)
     lanes = grid.lanes(layout, tasks, seed, numbers, ends_early=stop_at is not None)
-    lanes = split(layout.mesh, lanes)
-    params = replicate(layout.mesh, policy.params)
+    lanes, params = split(layout.mesh, lanes), replicate(layout.mesh, policy.params)
     judging = setting.judged.episodes
-    run = Run(programs, lanes, params, segments, most, grid, layout, num, judging, stop_at)
+    run = Run(programs, lanes, params, segments, grid, layout, num, judging, stop_at)
     record, cpu = run_segments(run, journal or Journal())
     # The judgement of the initial choice is recorded at episode 1, since a search begins by evaluating it.
     after = np.concatenate([[1], np.cumsum(segments) * num])

@@ -46,8 +46,6 @@ class Run(NamedTuple):
     params: Any
     segments: Sequence[int]
     """Rounds between judgements; the first judgement comes before all of them."""
-    max_rounds: int
-    """Largest number of rounds in a part."""
     grid: Grid
     layout: Layout
     round_episodes: int
@@ -92,32 +90,36 @@ def run_segments(run: Run, journal: Journal) -> tuple[Record, float]:
             before = _num_rounds(done)
             left = sum(rounds[: number + 1]) - before
             num = processes.from_first(lambda: _part_rounds(run, left, pace))  # noqa: B023
-            ends_segment = num == left
             stopped = np.zeros(grid.size, bool)
             if run.stop_at is not None and done:
                 stopped = ended([part.judged for part in done], run.stop_at)
                 lanes = run.without(stopped)
             cpu, wall = time.process_time(), time.monotonic()
-            shared = (params, jnp.int32(num), jnp.array(ends_segment), jnp.int32(number))
-            state, log, judged = advance((state, lanes), shared)
-            log, judged = fetch((log, judged))
+            shared = (params, jnp.int32(num), jnp.array(num == left), jnp.int32(number))
+            state, *results = advance((state, lanes), shared)
+            log, judged = fetch(tuple(results))
             wall = time.monotonic() - wall
             cpu = processes.total(time.process_time() - cpu)
-            pace = wall / (num * run.round_episodes + ends_segment * run.judging_episodes)
+            pace = wall / (num * run.round_episodes + (num == left) * run.judging_episodes)
             log = jax.tree.map(lambda rows, n=num: rows[: grid.size, :n], log)
             judged = jax.tree.map(lambda rows: rows[: grid.size], judged)
-            if not ends_segment:
-                judged = done[-1].judged
-            if stopped.any():
-                log, judged = filled(log, judged, stopped, [(p.log, p.judged) for p in done])
-            _check_finite(log, judged, grid, before)
+            part = _finished(Part(log, judged, num == left, cpu), done, stopped)
+            _check_finite(part.log, part.judged, grid, before)
             if watched:
                 _check_sound(state.search, run, before + num)
-            done.append(Part(log, judged, ends_segment, cpu))
+            done.append(part)
             keeper.keep(done, state)
             progress.update(num * per_round)
-            progress.show({"return": f"{judged.return_.mean():.3f}"})
+            progress.show({"return": f"{part.judged.return_.mean():.3f}"})
     return _record(done), sum(part.cpu_seconds for part in done)
+
+
+def _finished(part: Part, before: Sequence[Part], stopped: np.ndarray) -> Part:
+    """The part with the judgement that holds after it, and with what its stopped lanes left out."""
+    log, judged = part.log, part.judged if part.ends_segment else before[-1].judged
+    if stopped.any():
+        log, judged = filled(log, judged, stopped, [(one.log, one.judged) for one in before])
+    return part._replace(log=log, judged=judged)
 
 
 def _part_rounds(run: Run, left: int, pace: float | None) -> int:
@@ -132,7 +134,7 @@ def _part_rounds(run: Run, left: int, pace: float | None) -> int:
         return left
     if pace is None:
         return 1
-    fits = int(min(PART_SECONDS / (pace * run.round_episodes), run.max_rounds))
+    fits = int(min(PART_SECONDS / (pace * run.round_episodes), longest_part(run.segments)))
     num_parts = -(-left // max(fits, 1))
     return -(-left // num_parts)
 

@@ -10,7 +10,8 @@ import pytest
 import envs
 from envs.errors import DataError, UsageError
 from envs.wrappers import Wrapper
-from experiments.datasets import collect, find_demonstrator
+from experiments.datasets import collect
+from experiments.demonstrators import find_demonstrator
 from mgpo_jax.tasks import benchmark_tasks, task_hashes
 
 WORLD = envs.make("gridworld")

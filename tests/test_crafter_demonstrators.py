@@ -29,7 +29,7 @@ from envs.crafter.habits import TIERS, Habits, Plan, make_plan
 from envs.crafter.searching import DIG, LONGEST, MOVES, SIDE, WADE, Aims, Terrain
 from envs.episodes import run_episode
 from envs.errors import UsageError
-from experiments.datasets import find_demonstrator
+from experiments.demonstrators import find_demonstrator
 
 ENV = Crafter(name="crafter-symbolic", horizon=500)
 CENTER = np.array([32, 32], np.int32)

@@ -165,9 +165,7 @@ def test_a_journal_that_does_not_fit_is_not_used(damage: str, tmp_path: Path) ->
 def test_a_part_lasts_about_half_a_minute(left: int, seconds: float | None, rounds: int) -> None:
     nothing: Any = None
     for episodes in (1, 5):
-        run = Run(
-            nothing, nothing, nothing, [50], longest_part([50]), nothing, nothing, episodes, 1, None
-        )
+        run = Run(nothing, nothing, nothing, [50], nothing, nothing, episodes, 1, None)
         pace = None if seconds is None else seconds / episodes
         assert segments._part_rounds(run, left, pace) == rounds
 

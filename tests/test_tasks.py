@@ -14,7 +14,7 @@ from envs.errors import DataError, UsageError
 from envs.registry import Judgement
 from envs.wrappers import Wrapper
 from experiments import watching
-from experiments.datasets import find_demonstrator
+from experiments.demonstrators import find_demonstrator
 from experiments.watching import ReturnsOnTheWay
 from mgpo_jax.network_configs import network_config
 from mgpo_jax.optimizers.methods import judged_query

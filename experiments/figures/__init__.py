@@ -9,14 +9,8 @@ from experiments.figures.curves import (
     training_curve,
 )
 from experiments.figures.glance import Glance, at_a_glance, look_of
-from experiments.figures.rollouts import (
-    Play,
-    Save,
-    draw_longest,
-    figures_of_results,
-    figures_of_run,
-    later,
-)
+from experiments.figures.offered import Save, figures_of_results, figures_of_run, later
+from experiments.figures.rollouts import Play, draw_longest
 from experiments.figures.style import METHODS, STYLE, Look, method_styles
 
 __all__ = [

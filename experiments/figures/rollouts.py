@@ -1,14 +1,12 @@
 """Figures of prompts and of episodes under them, for any world that offers ``Pictures``.
 
 They follow the paper's figures: prompts (2), how prompt and behavior evolve (3 and 10), why the order of a
-prompt matters (5), and short and long prompts (9). Figures that a world does not offer are left out, and so
-are methods without prompts.
+prompt matters (5), and short and long prompts (9). ``figures.offered`` says which of them there are.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +21,6 @@ from matplotlib.lines import Line2D
 from envs.base import Episode, Goals, Task
 from envs.drawing import Film, Pictures, Shown, Stage, observations, write_films
 from experiments.figures.style import method_styles, styled
-from experiments.store.settings import file_name
 from mgpo_jax.prompts import Prompt, goals_of, sample_prompt
 
 if TYPE_CHECKING:
@@ -38,79 +35,9 @@ LEGEND_WIDTH = 5.0  # minimum width of a figure with a legend below it, in inche
 LABEL_ROOM = (0.9, 0.65)  # inches: width of row labels, and height of title and legend, of a search
 FRAME_HEIGHT = 200  # height that small frames are enlarged to, in pixels
 
-Save = Callable[[Path], object]
-"""Writes one picture to a path."""
 Play = Callable[[jax.Array, Task, np.ndarray, int, bool], Episode]
 """``(key, task, goals [k, G], num, greedy) -> Episode``: runs ``num`` episodes on a task under a prompt;
 numpy leaves ``[num, ..]``."""
-
-
-def figures_of_run(
-    pictures: Pictures, result: Results, which: Sequence[int]
-) -> Iterator[tuple[str, Save]]:
-    """The figures of one adaptation that need no policy: their file names and writers."""
-    if _has_prompts(result):
-        if pictures.prompts:
-            yield "prompts.png", later(prompts, pictures, {result.method: result}, which)
-        if pictures.search:
-            yield "search.png", later(search, pictures, result, which)
-
-
-def later(draw: Callable[..., Figure], *args: Any) -> Save:
-    """A writer that draws its figure only when it is called."""
-    return lambda path: draw(*args).savefig(path)
-
-
-def figures_of_results(
-    pictures: Pictures,
-    results: Mapping[str, Results],
-    play_with: Callable[[Results], Play],
-    which: Sequence[int],
-    seed: int,
-) -> Iterator[tuple[str, Save]]:
-    """The figures of some adaptations to the same tasks: their file names and writers.
-
-    Figures are drawn when their writers are called; all policies are loaded once the iterator is exhausted.
-
-    Args:
-      pictures: the pictures that the world offers.
-      results: adaptations by their labels in legends, "method" or "method (remark)".
-      play_with: makes the function that runs episodes for an adaptation.
-      which: indices of the tasks to draw; figures of a single task show the first.
-      seed: index of the seed to draw.
-    """
-    results = {label: result for label, result in results.items() if _has_prompts(result)}
-    if not results:
-        return
-    if pictures.prompts:
-        yield "prompts.png", later(prompts, pictures, results, which, seed)
-    key = jax.random.key(seed)
-    for number, (name, result) in enumerate(_file_names(results).items()):
-        if pictures.search:
-            yield f"{name}_search.png", later(search, pictures, result, which, seed)
-        drawn = (pictures.visits, pictures.known, pictures.episodes, pictures.video, pictures.frame)
-        if not any(drawn):
-            continue
-        play = play_with(result)
-        if pictures.visits:
-            if number == 0:
-                yield (
-                    "short_and_long.png",
-                    later(short_and_long, pictures, result, play, which, key),
-                )
-            for task in which:
-                draw = later(evolution, pictures, result, play, task, seed, key)
-                yield f"{name}_evolution_task{task}.png", draw
-        if pictures.known and result.reached is not None:
-            for task in which:
-                draw = later(known, pictures, result, play, task, seed, key)
-                yield f"{name}_known_task{task}.png", draw
-        if pictures.episodes:
-            draw = later(episodes, pictures, result, play, which, seed, key)
-            yield f"{name}_episodes.png", draw
-        if pictures.video or pictures.frame:
-            save = partial(video, pictures, result, play, which[0], seed, key)
-            yield f"{name}_episode_task{which[0]}.gif", save
 
 
 @styled
@@ -329,10 +256,6 @@ def draw_longest(
     return jax.tree.map(lambda leaf: leaf[longest], drawn)
 
 
-def _has_prompts(result: Results) -> bool:
-    return result.best_goals(0, 0) is not None
-
-
 def _num_slots(result: Results) -> int:
     """The maximum number of goals in a prompt of an adaptation."""
     return result.best["prompt.goals"].shape[-2]
@@ -342,15 +265,6 @@ def _best_goals(result: Results, seed: int, task: int, episodes: int | None = No
     goals = result.best_goals(seed, task, episodes)
     assert goals is not None  # figures of methods without prompts are left out
     return goals
-
-
-def _file_names(results: Mapping[str, Results]) -> dict[str, Results]:
-    """Results by file name: the method's name, with a number if it occurs more than once."""
-    names: dict[str, Results] = {}
-    for number, result in enumerate(results.values()):
-        method = file_name(result.method)
-        names[f"{method}_{number}" if method in names else method] = result
-    return names
 
 
 def _tasks_of(result: Results, which: Sequence[int]) -> list[Task]:

@@ -12,7 +12,7 @@ import jax
 import envs
 from envs.errors import DataError, UsageError, printable, shown
 from envs.registry import WORLDS, World
-from experiments.datasets import find_demonstrator
+from experiments.demonstrators import find_demonstrator
 from experiments.figures import training_curve
 from experiments.store.initial import INIT
 from experiments.store.metrics import METRICS, RESUME, read_metrics

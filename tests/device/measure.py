@@ -32,7 +32,8 @@ from envs.kitchen.fidelity import jit_for, kitchen, random_actions
 from envs.kitchen.model import SUBSTEPS, load_model
 from envs.kitchen.native import Stepper
 from envs.kitchen.physics import PhysicsState
-from experiments.datasets import collect, find_demonstrator
+from experiments.datasets import collect
+from experiments.demonstrators import find_demonstrator
 from experiments.measurements import bench_gradient_step
 from experiments.networks import configured_network
 from experiments.runtime import configure
