@@ -209,8 +209,8 @@ def proceed(
         state, row = traced(carry[0], index)
         return state, put_row(carry[1], row, index)
 
-    num_entries = num_rounds + jnp.where(judging, num_judged, 0)
-    state, log = jax.lax.fori_loop(0, num_entries, body, (state, blank))
+    num_judging = num_judged if judging is True else jnp.where(judging, num_judged, 0)
+    state, log = jax.lax.fori_loop(0, num_rounds + num_judging, body, (state, blank))
     judged = Judged(jnp.float32(jnp.nan), jnp.int32(0))
     if num_judged:
         returns, failed, goals = jax.tree.map(

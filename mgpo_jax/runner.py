@@ -139,15 +139,15 @@ def sweep(
     _check_room(env, grid, episodes)
     begin()
     layout = lay_out(env, grid.size, _memory_bytes(env, adapter, tasks))
-    programs = programs_of(method, setting, fixed, layout, longest_part(segments), keep_actions)
+    most = longest_part(segments, num * log_bytes(env, grid.size, 1))
+    programs = programs_of(method, setting, fixed, layout, most, keep_actions)
     lanes = grid.lanes(layout, tasks, seed, numbers, ends_early=stop_at is not None)
     lanes, params = split(layout.mesh, lanes), replicate(layout.mesh, policy.params)
-    judging = setting.judged.episodes
-    run = Run(programs, lanes, params, segments, grid, layout, num, judging, stop_at)
+    run = Run(programs, lanes, params, segments, most, grid, layout, num, stop_at)
     record, cpu = run_segments(run, journal or Journal())
     # The judgement of the initial choice is recorded at episode 1, since a search begins by evaluating it.
     after = np.concatenate([[1], np.cumsum(segments) * num])
-    per_lane = episodes + (len(segments) + 1) * judging
+    per_lane = episodes + (len(segments) + 1) * setting.judged.episodes
     total, cpu = seeds * grid.tasks * per_lane, cpu / grid.variants
     return [record.outcome(i, grid, after, total, cpu) for i in range(grid.variants)]
 

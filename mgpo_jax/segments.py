@@ -7,6 +7,7 @@ of about half a minute, each of which is one call of a compiled program that run
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Sequence
 from functools import cache
@@ -31,11 +32,12 @@ from mgpo_jax.stopping import ended, filled
 from mgpo_jax.trees import numbered_leaves, with_leaves
 
 PART_SECONDS = 30.0
-"""Wall time of a part that is aimed at; a part has at least one round."""
-MAX_ROUNDS = 10
-"""Largest number of rounds in a part, whose log is allocated on the devices."""
+"""The wall time, in seconds, that a part should take; one round may take longer."""
+MIN_ROOM, LOG_BYTES = 10, 1 << 28
+"""The log of a part, on the devices, has room for so many rounds, or for as many as need so many bytes."""
 SAVING_SHARE = 0.05
-"""Largest share of the time that saving takes within segments; at their end it is always done."""
+"""The largest share of the time that saving may take within a segment. At its end everything is saved,
+however long that takes."""
 
 
 class Run(NamedTuple):
@@ -46,12 +48,12 @@ class Run(NamedTuple):
     params: Any
     segments: Sequence[int]
     """Rounds between judgements; the first judgement comes before all of them."""
+    max_rounds: int
+    """Largest number of rounds in a part."""
     grid: Grid
     layout: Layout
     round_episodes: int
     """Number of episodes in a round of one lane."""
-    judging_episodes: int
-    """Number of episodes in a judgement of one lane."""
     stop_at: float | None
     """Judged return at which a search ends early; None if none does."""
 
@@ -61,9 +63,9 @@ class Run(NamedTuple):
         return self.lanes._replace(stopped=split(self.layout.mesh, jnp.asarray(stopped[index])))
 
 
-def longest_part(segments: Sequence[int]) -> int:
-    """The largest number of rounds in a part of these segments."""
-    return min(max(segments), MAX_ROUNDS)
+def longest_part(segments: Sequence[int], round_bytes: int) -> int:
+    """The largest number of rounds in a part of these segments, of which one leaves so many bytes."""
+    return min(max(segments), max(MIN_ROOM, LOG_BYTES // round_bytes))
 
 
 def run_segments(run: Run, journal: Journal) -> tuple[Record, float]:
@@ -100,8 +102,10 @@ def run_segments(run: Run, journal: Journal) -> tuple[Record, float]:
             log, judged = fetch(tuple(results))
             wall = time.monotonic() - wall
             cpu = processes.total(time.process_time() - cpu)
-            pace = wall / (num * run.round_episodes + (num == left) * run.judging_episodes)
-            log = jax.tree.map(lambda rows, n=num: rows[: grid.size, :n], log)
+            # Judging alone says little: methods that learn spend most of their time on learning.
+            pace = wall / num if num else None
+            # Copied, since a view would keep the memory of all the rows that the log has room for.
+            log = jax.tree.map(lambda rows, n=num: rows[: grid.size, :n].copy(), log)
             judged = jax.tree.map(lambda rows: rows[: grid.size], judged)
             part = _finished(Part(log, judged, num == left, cpu), done, stopped)
             _check_finite(part.log, part.judged, grid, before)
@@ -115,7 +119,7 @@ def run_segments(run: Run, journal: Journal) -> tuple[Record, float]:
 
 
 def _finished(part: Part, before: Sequence[Part], stopped: np.ndarray) -> Part:
-    """The part with the judgement that holds after it, and with what its stopped lanes left out."""
+    """The part with the latest judgement, and with the results of stopped lanes filled in."""
     log, judged = part.log, part.judged if part.ends_segment else before[-1].judged
     if stopped.any():
         log, judged = filled(log, judged, stopped, [(one.log, one.judged) for one in before])
@@ -128,15 +132,15 @@ def _part_rounds(run: Run, left: int, pace: float | None) -> int:
     Args:
       run: the run.
       left: rounds that are left in the segment.
-      pace: seconds that an episode of all lanes took in the last part; None if there was none.
+      pace: seconds that a round of all lanes took in the last part; None if it had no rounds.
     """
     if left <= 1:
         return left
     if pace is None:
         return 1
-    fits = int(min(PART_SECONDS / (pace * run.round_episodes), longest_part(run.segments)))
+    fits = int(min(PART_SECONDS / max(pace, 1e-9), run.max_rounds))
     num_parts = -(-left // max(fits, 1))
-    return -(-left // num_parts)
+    return -(-left // num_parts)  # parts of nearly equal length: 4, 3, 3 rather than 4, 4, 2
 
 
 def _num_rounds(done: Sequence[Part]) -> int:
@@ -204,7 +208,7 @@ def _check_sound(searches: Any, run: Run, rounds: int) -> None:
 
 
 class _Keeper:
-    """Saves finished parts and the state after them, as often as that takes little of the time."""
+    """Saves finished parts and the state after them, unless that would take too much of the time."""
 
     def __init__(self, journal: Journal, grid: Grid, num_kept: int) -> None:
         self.journal, self.grid, self.num_kept = journal, grid, num_kept
@@ -234,13 +238,18 @@ def _resumed(
     If any part is missing, the run starts again: no parts are returned, with the initial ``state``.
     """
     saved = journal.read("state")
-    if saved is None or "parts" not in saved:
+    if saved is None:
         return [], state
-    records = [journal.read(f"part{i:06}") for i in range(int(saved.pop("parts")))]
+    num_parts = int(saved.pop("parts", 0))  # older versions saved whole segments
+    records = [journal.read(f"part{i:06}") for i in range(num_parts)]
     log, judged = jax.tree.map(lambda leaf: 0, shapes)
     like = Part(log, judged, ends_segment=False, cpu_seconds=0.0)
     done = [with_leaves(like, record) for record in records if record is not None]
-    if len(done) < len(records):
+    if not num_parts or len(done) < num_parts:
+        if processes.is_first():
+            print(
+                "the saved part of the adaptation is incomplete: it starts again", file=sys.stderr
+            )
         return [], state
     # The lanes that pad the grid repeat its first ones.
     index = np.arange(run.layout.num_lanes) % run.grid.size

@@ -28,7 +28,7 @@ def filled(
 
     Args:
       log: the log of the part, rows of L lanes.
-      judged: the judgement after the part.
+      judged: the latest judgement (``Part.judged``).
       stopped: which searches had ended before the segment, [L].
       before: logs and judgements of the earlier parts, of which the first has only a judgement.
 

@@ -244,7 +244,9 @@ def test_processes_with_other_data_do_not_begin(place: Path, trained: Path, tmp_
 
 
 def test_an_adaptation_has_the_bits_of_one_process(place: Path) -> None:
-    (code, out, err), second = both(f"{ADAPT} --out two", place)
+    """Even if only process 0 wants to divide segments into parts of one round."""
+    words = ADAPT.replace("own_world", "short_parts")
+    (code, out, err), second = both(f"{words} --out two", place)
     assert code == 0, err
     assert "explore" in out
     assert second == (0, "", "")
@@ -258,6 +260,7 @@ def test_an_adaptation_has_the_bits_of_one_process(place: Path) -> None:
     for summary in summaries:
         assert summary.pop("cpu_seconds") > 0
         summary.pop("episodes_per_cpu_second", None)
+        summary.pop("env")  # the same world under two names
     assert summaries[0] == summaries[1]
 
 

@@ -407,7 +407,7 @@ def test_a_record_that_the_method_does_not_come_to_is_named(result: Path) -> Non
 
 def test_methods_without_arms_and_older_settings_have_none(result: Path) -> None:
     assert knowledge_of(load_results(result)) is None  # no hyper-parameters on record
-    for method in ("bbt", "grips"):
+    for method in ("bbt", "grips", "ppo", "reinforce-careful"):
         assert knowledge_of(few_tasks(load_results(ROOT / "results/maze15" / method), 1)) is None
 
 

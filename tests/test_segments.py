@@ -18,7 +18,7 @@ from mgpo_jax.journal import Journal
 from mgpo_jax.methods import UCB, Method, find
 from mgpo_jax.outcomes import Outcome
 from mgpo_jax.runner import sweep
-from mgpo_jax.segments import MAX_ROUNDS, Run, longest_part
+from mgpo_jax.segments import Run, longest_part
 
 EPISODES, EVERY = 10, 5
 SAMPLED = Judgement(mode="sample", episodes=3)  # returns that vary
@@ -77,15 +77,21 @@ class Fragile(Journal):
 @pytest.mark.parametrize("env", [MAZE, Point()])
 @pytest.mark.parametrize("early", [False, True])
 def test_parts_of_one_round_change_no_bit(
-    env: Environment, early: bool, in_single_rounds: Callable[[], None], tmp_path: Path
+    env: Environment,
+    early: bool,
+    in_single_rounds: Callable[[], None],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
     stop_at = float(np.median(run(env).eval_returns)) if early else None
+    monkeypatch.setattr(segments, "PART_SECONDS", np.inf)
     whole = run(env, Journal(tmp_path / "whole"), stop_at)
     in_single_rounds()
     parts = run(env, Journal(tmp_path / "parts"), stop_at)
     assert_same_bits(parts, whole)
     num = {name: len(list((tmp_path / name).glob("part*"))) for name in ("whole", "parts")}
-    assert num == {"whole": 1 + EPISODES // EVERY, "parts": 1 + EPISODES}
+    # The first round of all is a part of its own, since nothing is known of the speed before it.
+    assert num == {"whole": 1 + 1 + EPISODES // EVERY, "parts": 1 + EPISODES}
 
 
 def test_parts_of_a_method_with_several_episodes_in_a_round(
@@ -134,7 +140,9 @@ def test_parts_whose_saving_takes_long_are_saved_at_the_end_of_a_segment(
 
 
 @pytest.mark.parametrize("damage", ["missing part", "no number of parts"])
-def test_a_journal_that_does_not_fit_is_not_used(damage: str, tmp_path: Path) -> None:
+def test_a_journal_that_does_not_fit_is_not_used(
+    damage: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     whole = run(MAZE, Journal(tmp_path / "pieces"))
     journal = Journal(tmp_path / "pieces")
     if damage == "missing part":
@@ -145,6 +153,7 @@ def test_a_journal_that_does_not_fit_is_not_used(damage: str, tmp_path: Path) ->
         journal.write("state", {name: rows for name, rows in state.items() if name != "parts"})
     assert_same_bits(run(MAZE, journal), whole)
     assert (tmp_path / "pieces" / "part000001.npz").exists()
+    assert "it starts again" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -158,18 +167,28 @@ def test_a_journal_that_does_not_fit_is_not_used(damage: str, tmp_path: Path) ->
         (10, 7.0, 4),  # four fit; three parts of 4, 3 and 3 rather than 4, 4 and 2
         (6, 7.0, 3),
         (10, 1000.0, 1),
-        (50, 0.001, MAX_ROUNDS),
-        (12, 0.001, 6),
+        (50, 0.0, 10),  # as many as the log has room for
+        (12, 0.0, 6),
     ],
 )
 def test_a_part_lasts_about_half_a_minute(left: int, seconds: float | None, rounds: int) -> None:
     nothing: Any = None
-    for episodes in (1, 5):
-        run = Run(nothing, nothing, nothing, [50], nothing, nothing, episodes, 1, None)
-        pace = None if seconds is None else seconds / episodes
-        assert segments._part_rounds(run, left, pace) == rounds
+    run = Run(nothing, nothing, nothing, [50], 10, nothing, nothing, 1, None)
+    assert segments._part_rounds(run, left, seconds) == rounds
 
 
 def test_a_log_has_room_for_the_longest_part_only() -> None:
-    assert longest_part([2, 2, 1]) == 2
-    assert longest_part([50, 50]) == MAX_ROUNDS == 10
+    assert longest_part([2, 2, 1], 1 << 30) == 2
+    assert longest_part([50, 50], 1 << 30) == segments.MIN_ROOM == 10
+    assert longest_part([50, 20], 1 << 24) == segments.LOG_BYTES >> 24 == 16
+    assert longest_part([50, 20], 1) == 50
+
+
+def test_parts_keep_only_their_own_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A view would keep the memory of all the rows that the log has room for."""
+    kept: list[segments.Part] = []
+    join = segments._record
+    monkeypatch.setattr(segments, "_record", lambda done: kept.extend(done) or join(done))
+    run(MAZE)
+    for leaf in jax.tree.leaves([part.log for part in kept]):
+        assert leaf.base is None or leaf.base.nbytes == leaf.nbytes

@@ -14,7 +14,6 @@ from experiments.store.result_files import load_results, save_results
 from experiments.store.results import results_of
 from experiments.store.summary import summarize
 from experiments.store.summary_text import printed
-from mgpo_jax.journal import Journal
 from mgpo_jax.methods import UCB
 from mgpo_jax.runner import sweep
 
@@ -22,10 +21,10 @@ EPISODES, EVERY = 9, 3
 SAMPLED = Judgement(mode="sample", episodes=3)  # returns that vary
 
 
-def run(env, stop_at, journal=None):
+def run(env, stop_at):
     (found,) = sweep(
         env, untrained(env), tasks_of(env), UCB, [UCB.hyper()], seeds=2, episodes=EPISODES,
-        eval_every=EVERY, judged=SAMPLED, stop_at=stop_at, journal=journal,
+        eval_every=EVERY, judged=SAMPLED, stop_at=stop_at,
     )  # fmt: skip
     return found
 
@@ -61,18 +60,6 @@ def test_what_is_never_reached_ends_nothing():
     whole, same = run(MAZE, None), run(MAZE, 1e6)
     np.testing.assert_array_equal(whole.returns, same.returns)
     np.testing.assert_array_equal(whole.eval_returns, same.eval_returns)
-
-
-def test_it_goes_on_after_a_stop_as_without_one(tmp_path):
-    """The journal holds two segments, as after a kill; the third is run from there."""
-    stop_at = float(np.median(run(MAZE, None).eval_returns))
-    whole = run(MAZE, stop_at, Journal(tmp_path / "pieces"))
-    journal = Journal(tmp_path / "pieces")
-    state = journal.read("state")
-    assert state is not None
-    again = run(MAZE, stop_at, journal)
-    np.testing.assert_array_equal(again.returns, whole.returns)
-    np.testing.assert_array_equal(again.eval_returns, whole.eval_returns)
 
 
 def test_saved_episodes_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

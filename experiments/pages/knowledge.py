@@ -98,12 +98,14 @@ def told_adapter(results: Results) -> tuple[Adapter, Any] | None:
       round, or whose settings are those of an older version.
 
     Raises:
-      DataError: if the adapter cannot be made without weights.
+      DataError: if making the adapter without weights fails.
     """
     config = results.config
-    slots = results.choices["prompt.mask"].shape[-1] if "prompt.mask" in results.choices else 0
-    values = config.get("hyper")
-    if not slots or "greedy" not in results.choices or not isinstance(values, Mapping):
+    values, mask = config.get("hyper"), results.choices.get("prompt.mask")
+    if mask is None or "greedy" not in results.choices or not isinstance(values, Mapping):
+        return None
+    num_rounds, slots = mask.shape[2:]
+    if not slots or num_rounds != results.returns.shape[2]:
         return None
     try:
         method = METHODS.known(results.method, results.folder or CONFIG)
@@ -116,17 +118,16 @@ def told_adapter(results: Results) -> tuple[Adapter, Any] | None:
             judged=results.world.judged,
         )
         method.check_use(setting, hyper)
-    except (DataError, UsageError, ValidationError):  # settings of an older version
-        return None
-    try:
         adapter = method.adapter(setting, None, hyper)
         state = jax.eval_shape(adapter.init, jax.random.key(0), jnp.zeros(env.spec.goal_dim))
+    except (DataError, UsageError, ValidationError):  # settings of an older version
+        return None
     except Exception as error:  # a user's method may raise anything
         raise DataError(
-            f"what {method.name} knew cannot be shown, since it cannot be made without weights: "
-            f"{type(error).__name__}: {error}"
+            f"what {results.method} knew cannot be shown, since the method cannot be made again without "
+            f"weights: {type(error).__name__}: {error}"
         ) from error
-    return (adapter, state) if adapter.episodes_per_round == 1 else None
+    return adapter, state
 
 
 def blank_episode(spec: EnvSpec) -> Episode:
