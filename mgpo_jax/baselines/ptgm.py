@@ -230,7 +230,7 @@ def make_prior(setting: Setting, params: Any, hyper: NoHyper) -> Adapter:
 
 
 def make_oracle(setting: Setting, params: Any, hyper: NoHyper) -> Adapter:
-    """The high level that chooses the goals of the world's expert: an upper bound for the hierarchy."""
+    """The high level that chooses the goals of the world's expert: what the low level is good for."""
     del hyper
     config: CommandConfig = setting.network
 
