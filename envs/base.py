@@ -319,7 +319,8 @@ class Environment:
     def expert_goal(self, state: State, num_steps: int) -> Float[Array, "G"]:
         """The next goal to pursue, chosen by an expert with full knowledge of the task and the state.
 
-        With these goals a hierarchy is evaluated without learning its high level. Other goals may suit it better.
+        With these goals a hierarchy is evaluated without learning its high level, though other goals may
+        suit it better.
 
         Args:
           state: the state of an episode in progress.
