@@ -19,7 +19,7 @@ from envs.drawing import Film, Pictures, spread_apart, video, write_films
 from envs.maze import pictures as maze
 from envs.maze.env import NORTH, MazeRunner, MazeTask
 from experiments import figures
-from experiments.figures import rollouts
+from experiments.figures import offered, rollouts
 from mgpo_jax.distributions import Categorical
 from mgpo_jax.policy import Policy
 
@@ -268,7 +268,7 @@ def test_a_place_from_a_file_is_not_imported():
 def test_nothing_is_drawn_before_it_is_written(monkeypatch, tmp_path):
     drawn = []
     for name in ("prompts", "evolution", "short_and_long", "video"):
-        monkeypatch.setattr(rollouts, name, lambda *args, name=name: drawn.append(name) or Figure())
+        monkeypatch.setattr(offered, name, lambda *args, name=name: drawn.append(name) or Figure())
     results = {"ucb": fake_results()}
     planned = list(figures.figures_of_results(PICTURES, results, lambda result: PLAY, (1,), 0))
     assert len(planned) == 4
