@@ -40,13 +40,11 @@ def run(
 
 @pytest.fixture
 def in_single_rounds(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
-    """A function from whose call on every part has one round."""
+    """A function from whose call on every part has one round, and is saved however long that takes."""
 
     def shorten() -> None:
         monkeypatch.setattr(segments, "PART_SECONDS", 0.0)
-        monkeypatch.setattr(
-            segments, "SAVING_SHARE", np.inf
-        )  # save each part, however long it takes
+        monkeypatch.setattr(segments, "SAVING_SHARE", np.inf)
 
     return shorten
 
