@@ -17,6 +17,7 @@ from experiments import measurements
 from experiments.bench import BenchConfig, main
 from experiments.measurements import sequence_flops
 from experiments.store.presets import pretrain_preset
+from mgpo_jax import released
 from mgpo_jax.kinds import kind_of
 from mgpo_jax.network_configs import TransformerConfig
 
@@ -62,17 +63,20 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert all(name in printed for name in found)
 
 
-def test_baselines_without_a_released_network_start_from_random_weights() -> None:
-    """And what a world cannot have, such as a method whose check refuses it, has no row."""
-    world, env = envs.find("maze30"), envs.make("maze30")
-    dataset, _ = measurements.bench_collect(world, env, "astar2", 8)
-    recipe = pretrain_preset("maze30", "smoke", "spirl")
+def test_baselines_without_a_released_network_start_from_random_weights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(released, "RELEASED", tmp_path)
+    world, env = envs.find("maze15"), envs.make("maze15")
+    dataset, _ = measurements.bench_collect(world, env, "astar1", 8)
+    recipe = pretrain_preset("maze15", "smoke", "spirl")
     policy, note = measurements.policy_to_bench(world, env, recipe, dataset)
     assert note == "untrained policy"
     assert kind_of(policy.config).name == "spirl"
 
 
 def test_rows_of_baselines_are_per_episode_of_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A world that a method's check refuses, such as one without a list of goals, has no row of it."""
     asked = []
 
     def adapt(env, policy, tasks, method, hyper, *, seeds, episodes, eval_every):
