@@ -174,10 +174,26 @@ def behind_noise(
     Raises:
       UsageError: if such noise cannot be applied to the world.
     """
-    if not (obs_noise or action_noise):
-        return env
-    try:
-        return Noisy(env, obs_noise, action_noise)
-    except ValueError as error:
-        name = "--action-noise" if action_noise else "--obs-noise"
-        raise UsageError(f"{name}: {error}; give another size") from None
+    return noisy(env, obs_noise, action_noise) if obs_noise or action_noise else env
+
+
+def noisy(
+    env: Environment,
+    obs_noise: float = 0.0,
+    action_noise: float = 0.0,
+    obs_range: tuple[float, ...] = (),
+) -> Noisy:
+    """Wrap a world in noise of the sizes that the flags of a command give.
+
+    Raises:
+      UsageError: if such noise cannot be applied to the world; the message names the flag.
+    """
+    for name, sizes in {
+        "--obs-noise": (obs_noise, 0.0, obs_range),
+        "--action-noise": (0.0, action_noise, ()),
+    }.items():
+        try:
+            Noisy(env, *sizes)
+        except ValueError as error:
+            raise UsageError(f"{name}: {error}; give another size, or leave it out") from None
+    return Noisy(env, obs_noise, action_noise, obs_range)

@@ -48,10 +48,10 @@ def main(config: AdaptConfig) -> None:
         raise UsageError("--validation-seed says which validation tasks to draw; add --validation")
     folder = config.folder
     if config.sweep:
-        from experiments.sweeping import show, sweep_and_save, variants
+        from experiments.sweeping import check_finished, show, sweep_and_save, variants
 
         variants(config)
-    if config.sweep or not (config.resume and os.path.isdir(folder)):
+    if not (config.resume and os.path.isdir(folder)):
         refuse_existing(folder, "remove it", "choose another folder with --out")
     world = envs.find(config.env)
     join(config)
@@ -69,9 +69,13 @@ def main(config: AdaptConfig) -> None:
         say(of_adaptation(config, world, env, policy, tasks))
         return
     if config.sweep:
-        folders = sweep_and_save(config, world, env, policy, tasks)
+        if not processes.from_first(folder.is_dir):
+            sweep_and_save(config, world, env, policy, tasks)
+        elif processes.is_first():
+            check_finished(config, policy, tasks)
+            print(f"{folder} is already finished", file=sys.stderr)
         if processes.is_first():
-            show(config, folders)
+            show(config)
         print(f"results in {folder}", file=sys.stderr)
         return
     results = None

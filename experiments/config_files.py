@@ -20,6 +20,8 @@ OWN = frozenset({"config", "debug", "dry_run", "json", "out", "quiet", "resume",
 """Settings that belong to a single call of a command and are not taken from a file."""
 GROUPS = frozenset({"data", "train", "hyper"})
 """Nested settings in ``config.json``; each of their members has a flag."""
+IMPORTED = frozenset({"env", "method", "goal"})
+"""Settings that can name a module to import, as ``module:attribute``."""
 CHOOSER = {"hyper": "method"}
 """Groups to skip if a setting is typed: a method's hyper-parameters if the user names a method."""
 
@@ -42,8 +44,20 @@ def expanded(words: Sequence[str], config_class: type) -> list[str]:
     names = _names(config_class)
     given = {names.get(name, name) for name in map(_name_of, typed) if name}
     values = read_document(path, dict[str, Json], "give the config.json of a run")
+    _check_imports(values, given)
     added = [word for name, value in _settings(values, given) for word in _words(name, value)]
     return [*typed, *added, *words[len(typed) :]]
+
+
+def _check_imports(values: Mapping[str, Any], given: set[str]) -> None:
+    """Raise ``UsageError`` if the file names code of the user's own that the command line does not name."""
+    for name in sorted(IMPORTED & values.keys() - given):
+        for place in [values[name]] if isinstance(values[name], str) else values[name] or []:
+            if ":" in str(place):
+                raise UsageError(
+                    f"the config file names the code {shown(place)}, and a file never decides what is "
+                    f"imported; if you trust it, add {flag(name)} with this value"
+                )
 
 
 def _file_in(words: Sequence[str]) -> Path | None:

@@ -151,7 +151,7 @@ class Converter:
             )
         obs = suited(obs, who, "observations")
         rows: Rows = {"obs": obs[:num], "actions": self.actions(actions[:num], who)}
-        rows |= self.goals(who, arrays, obs, num)
+        rows |= self.goals(who, arrays, obs, len(actions), num)
         rewards = first_of(REWARDS, arrays)
         if rewards is not None and not self._lacks("rewards"):
             rows["rewards"] = np.asarray(rewards, np.float32).reshape(-1)[:num]
@@ -211,10 +211,20 @@ class Converter:
             )
         return np.where(np.isfinite(rows), np.clip(rows, -1, 1), rows)
 
-    def goals(self, who: str, arrays: Mapping[str, np.ndarray], obs: np.ndarray, num: int) -> Rows:
-        """Achieved goals, whether they count as reached, and outcomes, after each of ``num`` actions."""
+    def goals(
+        self,
+        who: str,
+        arrays: Mapping[str, np.ndarray],
+        obs: np.ndarray,
+        num_actions: int,
+        num: int,
+    ) -> Rows:
+        """Achieved goals, whether they count as reached, and outcomes, after each of the first ``num`` of
+        the episode's actions."""
         found = {
-            name: np.asarray(arrays[name][:num], DTYPES.get(name))
+            name: np.asarray(
+                after_actions(who, name, arrays[name], num_actions)[:num], DTYPES.get(name)
+            )
             for name in OWN_BY_STEP
             if name in arrays
         }
@@ -241,7 +251,7 @@ class Converter:
         found.setdefault("goal_reached", np.ones(num, bool))
         found.setdefault("outcomes", found["achieved_goals"])
         if "intended" in found:
-            found["intended"] = self.actions(arrays["intended"][:num], f"{who}, intended")
+            found["intended"] = self.actions(found["intended"], f"{who}, intended")
         return found
 
     def _achieved(
@@ -286,6 +296,23 @@ class Converter:
         except Exception as error:  # a function of a user may raise anything
             kind = type(error).__name__
             raise DataError(f"{who}: {what} raised {kind}: {printable(str(error))}") from None
+
+
+def after_actions(who: str, name: str, array: np.ndarray, num_actions: int) -> np.ndarray:
+    """The rows of an array that describe the world after each action.
+
+    An array with one row more describes the start as well, in its first row.
+
+    Raises:
+      BadEpisodeError: if the array has any other number of rows.
+    """
+    if name in DTYPES and len(array) == num_actions + 1:
+        return array[1:]
+    if len(array) != num_actions:
+        raise BadEpisodeError(
+            f"{who}: {name} has {len(array)} rows, wanted one for each of {num_actions} actions"
+        )
+    return array
 
 
 def check_rows(who: str, rows: Rows, num: int) -> None:

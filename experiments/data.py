@@ -93,7 +93,7 @@ RUNS: dict[str, Callable[[Any], None]] = {
 def command(argv: Sequence[str] | None = None) -> NoReturn:
     words = list(sys.argv[1:] if argv is None else argv)
     if words and words[0] in SUBCOMMANDS:
-        run(SUBCOMMANDS[words[0]], RUNS[words[0]], argv=words[1:])
+        run(SUBCOMMANDS[words[0]], RUNS[words[0]], argv=words[1:], subcommand=words[0])
     if words and not words[0].startswith("-"):  # an unknown subcommand: report it, not its flags
         words = words[:1]
     run(DataCommandConfig, main, argv=words)

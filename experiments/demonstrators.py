@@ -28,7 +28,7 @@ def find_demonstrator(world: World, env: Environment, name: str | None) -> tuple
     if not known:
         raise UsageError(
             f"{world.name} has no demonstrators, so no dataset can be collected; train on one of your own "
-            "with mgpo_jax.pretrain"
+            "with pretrain --data FOLDER"
         )
     name, *changes = (name or next(iter(known))).split(",")
     if name not in known:

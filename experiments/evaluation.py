@@ -15,7 +15,7 @@ from envs.base import Environment, Task
 from envs.errors import DataError, UsageError
 from envs.official import Official
 from envs.registry import WORLDS, World
-from envs.wrappers import Noisy
+from envs.wrappers import Noisy, noisy
 from experiments.store.layout import TASKS
 from experiments.store.policies import load_policy_of
 from experiments.store.result_files import load_results
@@ -101,11 +101,7 @@ def open_case(
             raise
         raise UsageError(_foreign_tasks_message(name, result.env)) from None
     obs_range = _official_noise(name, env, sizes)
-    try:
-        behind = [(noise, _add_noise(noise, env, obs_range)) for noise in sizes]
-    except ValueError as error:
-        flag = "--action-noise" if any(noise.action for noise in sizes) else "--obs-noise"
-        raise UsageError(f"{flag}: {error}; give another size") from None
+    behind = [(noise, _add_noise(noise, env, obs_range)) for noise in sizes]
     loaded = load_policy_of(result, world, policy)
     processes.check_agreed(
         {
@@ -156,8 +152,8 @@ def _add_noise(noise: Noise, env: Environment, obs_range: tuple[float, ...]) -> 
     """The world with noise added; ``obs_range`` has the half widths of the noise of its official
     implementation."""
     if isinstance(noise.obs, str):
-        return Noisy(env, action_noise=noise.action, obs_range=obs_range)
-    return Noisy(env, noise.obs, noise.action)
+        return noisy(env, action_noise=noise.action, obs_range=obs_range)
+    return noisy(env, noise.obs, noise.action)
 
 
 def _foreign_tasks_message(name: str, where: str) -> str:

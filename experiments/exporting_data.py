@@ -11,7 +11,8 @@ import numpy as np
 
 from envs.errors import DataError
 from experiments.converting import OWN_BY_STEP, OWN_BY_TRAJECTORY
-from experiments.sources import OWN, import_extra
+from experiments.sources import OWN
+from experiments.store.extras import import_extra
 from mgpo_jax.dataset import Dataset, load_dataset
 from mgpo_jax.files import new_folder, write_arrays
 from mgpo_jax.manifest import Facts, read_facts

@@ -33,9 +33,10 @@ def glance_of(world: World, others: Sequence[str] = ()) -> Glance:
       others: names of worlds that look the same.
 
     Raises:
-      UsageError: if the world is not installed, or draws no still pictures.
+      ImportError: if packages that the world needs are missing.
+      UsageError: if it draws no still pictures.
     """
-    env = envs.make(world.name)
+    env = world.make()
     if world.pictures is None:
         raise UsageError("the world draws no pictures")
     key = jax.random.key(SEED)

@@ -26,7 +26,7 @@ from experiments.comparisons import (
 from experiments.store import runs
 from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.layout import META
-from experiments.store.metrics import METRICS, read_metrics
+from experiments.store.metrics import METRICS, cpu_seconds_of_training, read_metrics
 from experiments.store.provenance import read_meta
 from experiments.store.reproduce_settings import ABLATIONS, COMPARISONS, GLANCE, ReproduceConfig
 from experiments.store.settings import DEFAULT_WORLD, PretrainConfig, file_name
@@ -158,7 +158,11 @@ def _ablation_pieces(config: ReproduceConfig) -> Iterator[Piece]:
             yield Piece(True, cpu_seconds_of(part.results))
         else:
             settings = AdaptConfig(
-                env=config.world, seeds=config.seeds, episodes=ablations.EPISODES, hyper=part.hyper
+                env=config.world,
+                method=part.method,
+                seeds=config.seeds,
+                episodes=ablations.EPISODES,
+                hyper=part.hyper,
             )
             yield Piece(False, _estimate(config, settings))
     for folder, training in trainings.items():
@@ -176,14 +180,7 @@ def price_of(training: PretrainConfig) -> float | None:
 
 def _seconds_in(folder: Path) -> float | None:
     """CPU-seconds of a training's gradient steps, from its metrics; None if they are not recorded."""
-    rows = _metrics(folder)
-    if not rows or any("cpu_seconds_per_step" not in row for row in rows):
-        return None
-    before = [0, *(row["step"] for row in rows[:-1])]
-    return sum(
-        row["cpu_seconds_per_step"] * (row["step"] - start)
-        for row, start in zip(rows, before, strict=True)
-    )
+    return cpu_seconds_of_training(_metrics(folder))
 
 
 def _steps_in(folder: Path) -> int:

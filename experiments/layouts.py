@@ -5,15 +5,18 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import socket
 import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from envs.errors import DataError, UsageError, shown
+from mgpo_jax.claims import cleaned_on_exit
 
 LAYOUT = re.compile(r"([1-9]\d{0,2})x([1-9]\d{0,2})")
 FORCED = "--xla_force_host_platform_device_count="
@@ -74,13 +77,21 @@ def measured(layout: str, words: Sequence[str]) -> list[dict[str, Any]]:
             if cores and hasattr(os, "sched_setaffinity"):
                 os.sched_setaffinity(process.pid, cores)
         try:
-            codes = [process.wait() for process in running]
+            with cleaned_on_exit(partial(_end, running, place)):
+                codes = [process.wait() for process in running]
         finally:
-            for process in running:
-                process.kill()
+            _end(running)
         if any(codes):
             raise DataError(f"the bench failed with the layout {layout}; the lines above say why")
         return json.loads(path.read_text())["rows"]
+
+
+def _end(running: Sequence[subprocess.Popen], place: str | None = None) -> None:
+    """Kill processes that still run, and remove the folder that they write to."""
+    for process in running:
+        process.kill()
+    if place is not None:
+        shutil.rmtree(place, ignore_errors=True)
 
 
 def _cores(num: int, devices: int) -> list[set[int]]:

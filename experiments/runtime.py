@@ -29,7 +29,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
-from envs.errors import DataError, UsageError, printable, shown
+from envs.errors import DataError, MissingExtraError, UsageError, printable, shown
 from experiments import signals
 from mgpo_jax import processes
 from mgpo_jax.claims import NO_ROOM, check_place
@@ -122,6 +122,7 @@ def run(
     main: Callable[[Any], None],
     default: Callable[[Any, Sequence[str]], Any] | None = None,
     argv: Sequence[str] | None = None,
+    subcommand: str = "",
 ) -> NoReturn:
     """Parse a command line into ``config_class`` and run ``main`` on it; exits.
 
@@ -132,6 +133,7 @@ def run(
       main: the command; its docstring is the text of ``--help``, and it imports whatever needs jax itself.
       default: chooses the defaults, where they depend on other flags; see ``parsing.parse``.
       argv: the words of the command line (default: those of the process).
+      subcommand: the word before them that chose this command, for messages.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words
@@ -142,7 +144,8 @@ def run(
             from experiments.parsing import parse
 
             text = main.__doc__ or ""
-            config = parse(config_class, words, default, description=text, prog=program_name())
+            prog = f"{program_name()} {subcommand}".rstrip()
+            config = parse(config_class, words, default, description=text, prog=prog)
             with _silence() if config.quiet else nullcontext():
                 configure()
                 main(config)
@@ -152,8 +155,8 @@ def run(
         _fail(str(stop), 128 + stop.number, debug, "")
     except KeyboardInterrupt:
         sys.exit(EXIT_INTERRUPTED)
-    except (UsageError, DataError) as error:
-        _fail(str(error), EXIT_USAGE if isinstance(error, UsageError) else EXIT_FAILED, debug)
+    except (UsageError, DataError, MissingExtraError) as error:
+        _fail(str(error), EXIT_FAILED if isinstance(error, DataError) else EXIT_USAGE, debug)
     except Exception as error:
         if processes.team() is not None:
             time.sleep(NEWS)

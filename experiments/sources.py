@@ -6,7 +6,6 @@ joined by slashes, such as ``observations/achieved_goal`` or ``infos/qpos``.
 
 from __future__ import annotations
 
-import importlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from envs.errors import DataError, UsageError, printable, shown
+from experiments.store.extras import import_extra
 from mgpo_jax.archives import array_headers, read_arrays
 from mgpo_jax.array_fields import ArrayField
 
@@ -92,18 +92,6 @@ def opened(source: str) -> Iterator[Source]:
         )
     else:
         yield _minari(_minari_by_id(source))
-
-
-def import_extra(module: str, extra: str) -> Any:
-    """Import a module that belongs to an extra of this package.
-
-    Raises:
-      UsageError: if it is not installed, with the command that installs it.
-    """
-    try:
-        return importlib.import_module(module)
-    except ImportError:
-        raise UsageError(f'{module} is not installed; run `pip install -e ".[{extra}]"`') from None
 
 
 def _minari_by_id(source: str) -> Any:
@@ -208,6 +196,8 @@ def _flat(kind: str, arrays: Mapping[str, Any], path: Path) -> Source:
     actions = first_of(ACTIONS, arrays)
     if actions is None:
         raise DataError(f"{path} lacks actions; it has {', '.join(sorted(arrays)) or 'no arrays'}")
+    if not actions.ndim or not len(actions):
+        raise DataError(f"{path} has no steps: its actions are {list(actions.shape)}")
     ends = _ends(arrays, len(actions), path)
     starts = np.concatenate([[0], ends[:-1]])
 
@@ -215,7 +205,7 @@ def _flat(kind: str, arrays: Mapping[str, Any], path: Path) -> Source:
         for index, (start, end) in enumerate(zip(starts.tolist(), ends.tolist(), strict=True)):
             found = {}
             for name, array in arrays.items():
-                if name in SIZED or name in LENGTHS:
+                if name in SIZED or name in LENGTHS or not array.ndim:
                     continue
                 if len(array) == len(actions):
                     found[name] = np.asarray(array[start:end])

@@ -5,15 +5,13 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
-from collections.abc import Sequence
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 from envs.base import Environment, Task
 from envs.errors import UsageError, nearest, shown
 from envs.registry import World
-from experiments.adaptation import adapt_all, deciding, results_with_summary
+from experiments.adaptation import adapt_all, deciding, finished, results_with_summary
 from experiments.runtime import say
 from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.provenance import provenance
@@ -77,13 +75,24 @@ def _values(text: str, config: AdaptConfig) -> tuple[str, list[int | float]]:
     return name, values
 
 
-def show(config: AdaptConfig, folders: Sequence[Path]) -> None:
+def check_finished(config: AdaptConfig, policy: LoadedPolicy, tasks: Task) -> None:
+    """Check a sweep that was finished before ``--resume`` was given; raises as ``finished`` does."""
+    for name, variant in variants(config).items():
+        if not variant.folder.is_dir():
+            raise UsageError(
+                f"{config.folder} holds no results of {name}; choose another folder with --out"
+            )
+        finished(variant.folder, variant, policy, tasks)
+
+
+def show(config: AdaptConfig) -> None:
     """Print a table of the variants, and draw their learning curves in one figure."""
     from experiments.drawing import write
     from experiments.figures import later, learning_curve
     from experiments.store.result_files import load_results
     from experiments.store.rows import as_json, comparison, read_row
 
+    folders = [variant.folder for variant in variants(config).values()]
     rows = [read_row(folder) for folder in folders]
     say(json.dumps([as_json(row) for row in rows], indent=2) if config.json else comparison(rows))
     if config.figures:
@@ -93,11 +102,8 @@ def show(config: AdaptConfig, folders: Sequence[Path]) -> None:
 
 def sweep_and_save(
     config: AdaptConfig, world: World, env: Environment, policy: LoadedPolicy, tasks: Task
-) -> list[Path]:
+) -> None:
     """Adapt with every variant, and write the results of each to a folder below ``config.folder``.
-
-    Returns:
-      The folders, in the order of the variants.
 
     Raises:
       UsageError: for an invalid sweep, or unfinished work without ``--resume``.
@@ -116,4 +122,3 @@ def sweep_and_save(
             write_results(
                 place, results, config.folder / name, {**work.meta, "settings": settings[name]}
             )
-    return [config.folder / name for name in named]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,7 +15,7 @@ import pytest
 
 import envs
 from envs.errors import UsageError
-from experiments import measurements
+from experiments import layouts, measurements
 from experiments.bench import BenchConfig, main
 from experiments.measurements import sequence_flops
 from experiments.store.presets import pretrain_preset
@@ -97,3 +99,11 @@ def test_rows_of_baselines_are_per_episode_of_the_search(monkeypatch: pytest.Mon
     assert rows[0].note == "made, 4 tasks x 40 episodes of 30 steps"
     assert [kind for kind, *_ in asked] == ["mgpo", "mgpo", "ptgm", "spirl"]
     assert {tuple(rest) for _, _, *rest in asked} == {(1, 40, 40)}
+
+
+def test_a_bench_that_is_stopped_leaves_no_process_and_no_folder(tmp_path: Path) -> None:
+    process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    (tmp_path / "rows").mkdir()
+    layouts._end([process], str(tmp_path / "rows"))
+    assert process.wait(timeout=30) != 0
+    assert not list(tmp_path.iterdir())

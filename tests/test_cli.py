@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 
 import envs
+from envs.errors import MissingExtraError
 from envs.registry import WORLDS
 from experiments import pretrain, runtime, training
 from experiments.__main__ import COMMANDS
@@ -167,6 +168,16 @@ def test_unexpected_errors_are_one_line(command: Run, monkeypatch: pytest.Monkey
     assert text.startswith("error: unexpected error: division by zero; ")
     assert "--debug" in text
     assert "Traceback" not in text
+
+
+def test_a_missing_package_is_an_error_of_usage(
+    command: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def missing(name: str) -> None:
+        raise MissingExtraError("it needs a package; install it")
+
+    monkeypatch.setattr(envs, "make", missing)
+    assert command("collect") == (2, "error: it needs a package; install it\n")
 
 
 @pytest.fixture

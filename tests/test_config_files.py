@@ -15,6 +15,7 @@ from experiments.parsing import parse
 from experiments.runtime import run
 from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.presets import pretrain_default
+from experiments.store.reproduce_settings import ReproduceConfig
 from experiments.store.settings import PretrainConfig
 from experiments.table import TableConfig
 from mgpo_jax.files import to_json
@@ -73,6 +74,20 @@ def test_damaged_files_are_named(
         (tmp_path / "config.json").write_text(content)
     with pytest.raises(error, match=says):
         parse(AdaptConfig, ["--config", str(tmp_path / "config.json")], adapt_default)
+
+
+def test_a_file_never_decides_what_is_imported(tmp_path: Path) -> None:
+    path = tmp_path / "config.json"
+    path.write_text('{"env": "evil:WORLD"}')
+    with pytest.raises(
+        UsageError, match=r"names the code 'evil:WORLD'.* add --env with this value"
+    ):
+        parse(AdaptConfig, ["--config", str(path)], adapt_default)
+    config = parse(AdaptConfig, [f"--config={path}", "--env", "maze15"], adapt_default)
+    assert config.env == "maze15"
+    path.write_text('{"env": ["maze15", "evil:WORLD"]}')
+    with pytest.raises(UsageError, match="names the code 'evil:WORLD'"):
+        parse(ReproduceConfig, ["table1", "--config", str(path)])
 
 
 def test_a_flag_without_its_file() -> None:

@@ -335,6 +335,16 @@ def test_a_resumed_run_equals_an_uninterrupted_one(command: Run, meanwhile: str)
     assert names[0] == names[1]
 
 
+def test_a_resumed_run_in_its_own_folder_reads_its_copy(here: Path) -> None:
+    """The folder depends on the world, which is the default one if none is named."""
+    folder = parsed(f"pretrain --env {DEFAULT_WORLD}").folder
+    shutil.copytree("half", folder)
+    shutil.rmtree("first")
+    resumed = "pretrain --init first/policy --resume"
+    assert parsed(resumed) == parsed(f"{resumed} --env {DEFAULT_WORLD}")
+    assert parsed(resumed).embed_dim == 8
+
+
 def test_a_run_with_other_weights_or_without_is_another_run(command: Run) -> None:
     for line, says in {
         HALF.replace("first/policy", "other/policy"): "init 'first/policy' -> 'other/policy'",

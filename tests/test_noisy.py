@@ -140,6 +140,9 @@ def test_a_world_behind_no_noise_is_itself():
         UsageError, match=r"--action-noise: .* a probability, found 2.0; give another"
     ):
         behind_noise(MAZE, 0.0, 2.0)
+    # The flag at fault is named, whichever others are given.
+    with pytest.raises(UsageError, match="--obs-noise: noise must be finite"):
+        behind_noise(MAZE, -1.0, 0.5)
 
 
 def test_codes_take_no_noise():

@@ -113,6 +113,25 @@ def test_a_folder_of_episodes_is_the_same_dataset_as_flat_arrays():
     assert_same(imported("logs.npz")[0], imported("episodes", "other")[0])
 
 
+def test_goals_with_one_for_the_start_are_those_after_each_action():
+    """Arrays named like those of our exports, with a row for each observation."""
+    Path("episodes").mkdir()
+    for index, episode in enumerate(logged()):
+        goals = episode["observations"][:, :2]
+        np.savez(f"episodes/{index}.npz", **episode, achieved_goals=goals)
+    dataset, _, _ = imported("episodes", goal_columns=())
+    np.testing.assert_array_equal(dataset.achieved_goals[:3], [[1, 1], [2, 2], [3, 3]])
+    np.savez("episodes/0.npz", **logged()[0], achieved_goals=np.zeros((2, 2)))
+    with pytest.raises(DataError, match="achieved_goals has 2 rows, wanted one for each of 3 act"):
+        imported("episodes", "other", goal_columns=())
+
+
+def test_single_numbers_in_a_file_are_left_out():
+    np.savez("logs.npz", **flat(logged()), gamma=0.99)
+    dataset, _, _ = imported("logs.npz")
+    assert dataset.lengths.tolist() == [3, 2, 4]
+
+
 def test_parquet_files_are_the_same_dataset():
     pyarrow = pytest.importorskip("pyarrow", reason='needs `pip install -e ".[parquet]"`')
     from pyarrow import parquet
@@ -391,6 +410,11 @@ def test_settings_that_do_not_fit_the_logs(settings, says):
     [
         ({"x": np.zeros(2)}, "lacks actions; it has x"),
         (
+            {"actions": np.zeros((0, 1)), "terminals": np.zeros(0)},
+            r"no steps: its actions are \[0, 1",
+        ),
+        ({"actions": np.float32(1)}, r"no steps: its actions are \[\]"),
+        (
             {"actions": np.zeros((3, 1)), "observations": np.zeros((3, 1))},
             "has no terminals, timeouts or lengths",
         ),
@@ -614,6 +638,7 @@ def test_the_command_from_logs_to_logs(capsys):
         ("check mine --env maze51", 2, "did you mean 'maze15'?"),
         ("check mine --env maze15", 1, "actions must hold integers, found float32"),
         ("imprt", 2, "did you mean 'import'?"),
+        ("import walk.npz --typo", 2, " import --help"),
         ("", 2, "name one of import, export, check, info"),
     ):
         found, _, err = call(capsys, line)

@@ -20,7 +20,7 @@ import pytest
 from made_results import TINY, made_results
 from PIL import Image
 
-from envs.errors import UsageError
+from envs.errors import DataError, UsageError
 from envs.gridworld import GRIDWORLD
 from envs.maze import MAZE15
 from envs.registry import WORLDS, World
@@ -382,6 +382,26 @@ def test_arms_are_those_of_an_adaptation(world: str, method: str) -> None:
             assert np.mean(history[row]) == pytest.approx(means[seed, task, episode], abs=1e-4)
 
 
+def test_an_arm_can_be_pulled_more_than_255_times() -> None:
+    results = few_tasks(load_results(ROOT / "results/maze15/ucb", parts=("choices",)), 1)
+    repeated = {
+        name: np.repeat(array[:1, :, :1], 600, axis=2) for name, array in results.choices.items()
+    }
+    knowledge = knowledge_of(
+        replace(results, returns=np.full((1, 1, 600), -1.0, np.float32), choices=repeated)
+    )
+    assert knowledge is not None
+    pulls = knowledge.pulls[0, 0].tolist()
+    assert pulls == sorted(pulls)
+    assert pulls[-1] > 255
+
+
+def test_searches_that_ended_early_are_not_taken_for_those_of_another_version() -> None:
+    results = few_tasks(load_results(ROOT / "results/maze15/ucb", parts=("choices",)), 1)
+    with pytest.raises(DataError, match="ended early"):
+        knowledge_of(replace(results, config={**results.config, "stop_at": -0.2}))
+
+
 def few_tasks(results: Results, num: int) -> Results:
     def cut(parts: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         return {name: array[:, :num] for name, array in parts.items()}
@@ -460,6 +480,13 @@ def test_weights_that_half_precision_cannot_hold_are_refused() -> None:
     params = {"params": {**policy.params["params"], "head": head}}
     with pytest.raises(UsageError, match="head/bias"):
         world_data(MAZE15, policy._replace(params=params))
+
+
+def test_a_policy_that_the_page_cannot_run_is_refused() -> None:
+    policy = load_policy(MAZE15)
+    joint = replace(policy.config, tokens_per_step=1)
+    with pytest.raises(UsageError, match=r"encoder linear and 1 token\(s\) per step"):
+        world_data(MAZE15, policy._replace(config=joint))
 
 
 def test_a_world_without_rules_has_no_playground() -> None:

@@ -15,7 +15,7 @@ import pytest
 
 import envs
 from experiments.release import command
-from experiments.store.cards import cpu_minutes
+from experiments.store.metrics import cpu_seconds_of_training
 from experiments.store.settings import PretrainConfig
 from mgpo_jax.files import to_json
 from mgpo_jax.network_configs import network_config
@@ -122,6 +122,18 @@ def test_the_card_tells_how_that_policy_was_trained(run: Path, release: Release)
     assert row in (run.with_name("packed") / "README.md").read_text().splitlines()
 
 
+def test_the_card_says_that_the_data_are_a_users_own(run: Path, release: Release) -> None:
+    """Of any name, in a world whose demonstrators have made none of them."""
+    path = run / "policy" / "config.json"
+    document = json.loads(path.read_text())
+    document["made"]["config"]["data"] |= {"data_folder": "logs/mine", "trajectories": 321}
+    path.write_text(json.dumps(document))
+    assert release()[0] == 0
+    card = (run.with_name("packed") / "README.md").read_text()
+    assert "| data | 321 trajectories of the dataset mine |" in card
+    assert "demonstrations" not in card
+
+
 @pytest.mark.parametrize(
     ("sha256", "text"),
     [("0c" * 32, "seed 0 (6,798 in stock, 2 in reduced) |"), ("0d" * 32, "seed 0 |")],
@@ -222,6 +234,7 @@ def test_requests_that_are_refused(run: Path, release: Release) -> None:
     assert (code, "no finished policy" in text) == (2, True), text
 
 
-def test_the_minutes_of_a_training_are_those_of_its_steps() -> None:
+def test_the_cpu_time_of_a_training_is_that_of_its_steps() -> None:
     rows = [{"step": 60, "cpu_seconds_per_step": 0.5}, {"step": 120, "cpu_seconds_per_step": 1.0}]
-    assert cpu_minutes(rows) == pytest.approx(1.5)
+    assert cpu_seconds_of_training(rows) == pytest.approx(90)
+    assert cpu_seconds_of_training([*rows, {"step": 180}]) is None

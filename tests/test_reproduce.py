@@ -370,15 +370,22 @@ def test_the_inventory_counts_prices_and_doubts(tmp_path: Path) -> None:
     # Of SPiRL and PTGM nothing is published in the larger mazes that tells a price.
     larger = rows_of("maze30")["table1"]
     assert re.fullmatch(r"\d+\.\d \+ \?", larger[3])
-    # The published PPO has one seed, so it prices its three seeds and those of its careful form.
-    one = read_summary(Path("results/maze30/ppo"))["cpu_seconds"] / 60
-    assert 6 * one < float(larger[3].split()[0]) < 6 * one + 1
+    # PPO and REINFORCE have one published seed each. They price three seeds of PPO and of its careful form.
+    ppo, reinforce = (
+        read_summary(Path("results/maze30", name))["cpu_seconds"] / 60
+        for name in ("ppo", "reinforce")
+    )
+    both = 3 * ppo + 3 * (ppo + reinforce) / 2
+    assert both < float(larger[3].split()[0]) < both + 1
     spent = read_summary(Path("results/maze15/ucb"))["cpu_seconds"]
     assert rows["figure3"][1:3] == ["1 of 1", f"{spent / 60:.1f}"]
     assert rows["table3"][1] == "0 of 35"
     assert rows["table5"][1] == "0 of 4"
     # Four trainings of 2,000 steps at the speed of the released policy, and four times UCB.
     assert 4 * 2_000 * 0.2 / 60 < float(rows["table5"][3]) < 4 * (2_000 * 0.4 + 2 * spent) / 60
+    # Five rows of the ablation are searches by the plan, and one is a search by UCB.
+    plan = read_summary(Path("results/maze15/plan"))["cpu_seconds"]
+    assert float(rows["plan"][3]) == pytest.approx((5 * plan + spent) / 60, rel=0.05)
     assert rows["heads"][1] == "-"
     assert "heads is not available for maze15" in rows["heads"][3]
     assert rows["figure11"][1] == "0 of 1"

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from experiments.store.provenance import Meta
+from experiments.store.provenance import Meta, revision
 from experiments.store.runs import changes, identity, say_what_differs
 from experiments.store.settings import PretrainConfig
 
@@ -64,3 +66,16 @@ def test_the_hardware_in_words() -> None:
         assert Meta(devices=[cpu], device_kinds=["cpu"]).on_cpus
     assert Meta(devices=["cpu:0"], device_kinds=["cpu"]).hardware == "1 x cpu"
     assert Meta().on_cpus  # files of the first version record no devices
+
+
+def test_the_revision_is_that_of_the_code_alone(tmp_path: Path) -> None:
+    """Not that of a repository which the environment of an installed copy lies in."""
+    installed = tmp_path / ".venv" / "site-packages"
+    installed.mkdir(parents=True)
+    (tmp_path / "file").touch()
+    user = ("-c", "user.name=a", "-c", "user.email=a@b.c")
+    for words in (("init", "-q"), ("add", "file"), (*user, "commit", "-q", "-m", "first")):
+        subprocess.run(["git", *words], cwd=tmp_path, check=True)
+    assert revision(installed) == "unknown"
+    assert re.fullmatch(r"[0-9a-f]{12}", revision(tmp_path))
+    assert revision(tmp_path / "nowhere") == "unknown"

@@ -94,3 +94,20 @@ def test_a_sweep_is_its_single_runs(
         np.testing.assert_array_equal(found.returns, alone.returns)
         np.testing.assert_array_equal(found.eval_returns, alone.eval_returns)
     assert (tmp_path / "sweep" / "learning_curve.png").is_file()
+    # A scheduler may pass --resume again after the sweep has finished.
+    words = (
+        f"--env tiny --policy {tmp_path}/policy --tasks {tmp_path}/tasks.npz --seeds 2 --episodes 6"
+    )
+    words += f" --eval-every 6 --out {tmp_path}/sweep --resume --sweep"
+    adapt.main(config_of(f"{words} c=0,5"))
+    said = capsys.readouterr()
+    assert "is already finished" in said.err
+    assert said.out == text
+    for values, says in {
+        "c=0,1": "holds no results of c=1",
+        "c=0,5 --seed 1": "other settings",
+    }.items():
+        with pytest.raises(UsageError, match=says):
+            adapt.main(config_of(f"{words} {values}"))
+    with pytest.raises(UsageError, match="already exists"):
+        adapt.main(config_of(f"{words.replace(' --resume', '')} c=0,5"))

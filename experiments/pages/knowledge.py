@@ -43,11 +43,13 @@ def knowledge_of(results: Results) -> Knowledge | None:
     """What a search knew after each episode, or None for a method without a table of arms.
 
     Raises:
-      DataError: if the present version of the method does not arrive at the recorded prompts.
+      DataError: if the present version of the method does not arrive at the recorded prompts, or searches
+        ended early.
     """
     found = told_adapter(results)
     if found is None or not isinstance(getattr(found[1], "arms", None), Arms):
         return None
+    check_not_stopped(results)
     adapter, spec = found[0], results.world.make().spec
     names = ("prompt.goals", "prompt.mask", "greedy")
     goals, mask, greedy = (jnp.asarray(results.choices[name]) for name in names)
@@ -77,7 +79,15 @@ def knowledge_of(results: Results) -> Knowledge | None:
     row, pulls, mean, fits = (np.asarray(leaf) for leaf in changes)
     if not fits.all():
         raise disagreement(results)
-    return Knowledge(row.astype(np.uint8), pulls.astype(np.uint8), mean)
+    return Knowledge(row.astype(np.uint8), pulls.astype(np.uint32), mean)
+
+
+def check_not_stopped(results: Results) -> None:
+    """Raise ``DataError`` for searches that could end early, whose later episodes are only placeholders."""
+    if results.episodes_used is not None:
+        raise DataError(
+            "what the optimizer knew cannot be shown for searches that ended early (--stop-at)"
+        )
 
 
 def disagreement(results: Results) -> DataError:

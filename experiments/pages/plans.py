@@ -18,7 +18,12 @@ import numpy as np
 from envs.base import EnvSpec, Episode
 from envs.episodes import replay
 from envs.errors import DataError
-from experiments.pages.knowledge import blank_episode, disagreement, told_adapter
+from experiments.pages.knowledge import (
+    blank_episode,
+    check_not_stopped,
+    disagreement,
+    told_adapter,
+)
 from experiments.pages.packing import smallest
 from experiments.store.results import Results
 from mgpo_jax.adaptation import Adapter
@@ -72,11 +77,8 @@ def plan_of(results: Results) -> Arrays:
     if found is None:
         return {}
     adapter, state = found
-    models = MapState, OrderState, WorthState
-    if isinstance(state, models) and results.episodes_used is not None:
-        raise DataError(
-            "what the optimizer knew cannot be shown for searches that ended early (--stop-at)"
-        )
+    if isinstance(state, MapState | OrderState | WorthState):
+        check_not_stopped(results)
     if isinstance(state, MapState):
         return _map_arrays(results, adapter)
     if isinstance(state, OrderState):

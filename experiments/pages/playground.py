@@ -48,10 +48,12 @@ def world_data(world: World, policy: LoadedPolicy) -> dict[str, Any]:
             f"no playground can be made of {world.name}: its page (World.page) does not implement the "
             "rules of the world"
         )
-    if network.head != "categorical" or network.encoder != "linear":
+    form = (network.head, network.encoder, network.tokens_per_step)
+    if form != ("categorical", "linear", 2):
         raise UsageError(
-            f"the policy of {world.name} has the head {network.head} and the encoder {network.encoder}; a "
-            "playground supports only the head categorical with the encoder linear"
+            f"the policy of {world.name} has the head {form[0]}, the encoder {form[1]} and {form[2]} "
+            "token(s) per step; a playground supports only the head categorical with the encoder linear "
+            "and 2 tokens per step"
         )
     return {
         "name": world.name,

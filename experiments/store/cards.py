@@ -15,7 +15,7 @@ from envs.registry import WORLDS, World
 from experiments.demonstrators import find_demonstrator
 from experiments.figures import training_curve
 from experiments.store.initial import INIT
-from experiments.store.metrics import METRICS, RESUME, read_metrics
+from experiments.store.metrics import METRICS, RESUME, cpu_seconds_of_training, read_metrics
 from experiments.store.provenance import read_meta
 from experiments.store.settings import NO_WORLD, PretrainConfig, pretraining_from
 from mgpo_jax.dataset import variant_counts
@@ -33,7 +33,7 @@ CARD = """# {title} for {env}
 | | |
 | --- | --- |
 {facts}
-| data | {trajectories:,} demonstrations of {demonstrator}, seed {data_seed}{variants} |{begun}
+| data | {data}{variants} |{begun}
 | training | {steps:,} steps of {batch_size} trajectories, {optimizer}, {cpu_minutes:.0f} CPU-minutes |
 | validation loss | {val_loss:.4f} nats per action; {correct}: {val_accuracy:.4f} |
 | {acting} return of {watched} | {initial:.3f} on {eval_tasks} validation tasks |{followed}
@@ -128,14 +128,6 @@ def _without_out(command: Sequence[str]) -> list[str]:
     return shown
 
 
-def cpu_minutes(rows: Sequence[dict[str, Any]]) -> float:
-    """The CPU-minutes of a training, from its metrics."""
-    starts = [0, *(row["step"] for row in rows)]
-    spans = [row["step"] - start for start, row in zip(starts, rows, strict=False)]
-    seconds = (row["cpu_seconds_per_step"] * n for row, n in zip(rows, spans, strict=True))
-    return sum(seconds) / 60
-
-
 def card(run: Finished) -> str:
     """The model card of a released policy, in Markdown."""
     settings, last, env = run.settings, run.rows[-1], run.world.make()
@@ -158,15 +150,13 @@ def card(run: Finished) -> str:
         watched=run.kind.watched,
         files=goals + tasks,
         where="on them" if tested else "of the methods that use it",
-        trajectories=settings.data.trajectories,
-        demonstrator=find_demonstrator(run.world, env, settings.data.demonstrator)[0],
-        data_seed=settings.data.data_seed,
+        data=_data(run, env),
         variants=_variants(run),
         begun=_begun(run),
         steps=last["step"],
         batch_size=settings.train.batch_size,
         optimizer=settings.train.optimizer,
-        cpu_minutes=cpu_minutes(run.rows),
+        cpu_minutes=(cpu_seconds_of_training(run.rows) or 0) / 60,
         val_loss=last["val/loss"],
         val_accuracy=last["val/accuracy"],
         acting=acting,
@@ -178,6 +168,17 @@ def card(run: Finished) -> str:
         eval_tasks=settings.eval_tasks,
         command=printable(run.command),
     )
+
+
+def _data(run: Finished, env: Environment) -> str:
+    """The text of a card on the dataset: demonstrations, or trajectories from elsewhere."""
+    data = run.settings.data
+    if data.data_folder is not None:
+        return (
+            f"{data.trajectories:,} trajectories of the dataset {printable(data.data_folder.name)}"
+        )
+    name, _ = find_demonstrator(run.world, env, data.demonstrator)
+    return f"{data.trajectories:,} demonstrations of {name}, seed {data.data_seed}"
 
 
 def _variants(run: Finished) -> str:

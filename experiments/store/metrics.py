@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import os
 import sys
@@ -12,7 +11,8 @@ from typing import Annotated, Any
 
 from pydantic import AllowInfNan, Strict
 
-from envs.errors import DataError, UsageError
+from envs.errors import DataError
+from experiments.store.extras import import_extra
 from experiments.store.settings import PretrainConfig
 from mgpo_jax.files import to_json, write_text
 from mgpo_jax.schema import read_json_lines
@@ -71,7 +71,7 @@ def check_loggers(config: PretrainConfig) -> None:
     """Raise ``UsageError`` for a requested logger that is not installed."""
     for setting, module in LOGGERS.items():
         if getattr(config, setting):
-            _optional(module, setting)
+            import_extra(module, setting)
 
 
 class Metrics:
@@ -92,12 +92,12 @@ class Metrics:
         self.rows = [dict(row) for row in rows]
         self.writers: list[Callable[[dict[str, float], int], Any]] = []
         if config.tb:
-            board = _optional("tensorboardX", "tb").SummaryWriter(str(folder / "tensorboard"))
+            board = import_extra("tensorboardX", "tb").SummaryWriter(str(folder / "tensorboard"))
             self.writers.append(
                 lambda row, step: [board.add_scalar(k, v, step) for k, v in row.items()]
             )
         if config.wandb:
-            wandb = _optional("wandb", "wandb")
+            wandb = import_extra("wandb", "wandb")
             wandb.init(project="mgpo-jax", name=str(folder), config=to_json(config))
             self.writers.append(lambda row, step: wandb.log(row, step=step))
 
@@ -116,8 +116,12 @@ def _line(row: Mapping[str, float]) -> str:
     return json.dumps(row, allow_nan=False) + "\n"
 
 
-def _optional(module: str, extra: str) -> Any:
-    try:
-        return importlib.import_module(module)
-    except ImportError:
-        raise UsageError(f'{module} is not installed; run `pip install -e ".[{extra}]"`') from None
+def cpu_seconds_of_training(rows: Sequence[Mapping[str, float]]) -> float | None:
+    """The CPU-seconds of a training's gradient steps, from its metrics; None if they are not recorded."""
+    if not rows or any("cpu_seconds_per_step" not in row for row in rows):
+        return None
+    before = [0, *(row["step"] for row in rows[:-1])]
+    return sum(
+        row["cpu_seconds_per_step"] * (row["step"] - start)
+        for row, start in zip(rows, before, strict=True)
+    )

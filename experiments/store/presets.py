@@ -99,6 +99,7 @@ def pretrain_default(config: PretrainConfig, flags: Iterable[str] = ()) -> Pretr
     default = _preset_of(config)
     if config.init is None:
         return default
+    config = replace(config, env=default.env)  # which the folder of the run depends on
     if goes_on(config):
         run = saved_pretraining(config.folder / CONFIG)
         return with_settings(default, {name: getattr(run, name) for name in OF_INITIAL})

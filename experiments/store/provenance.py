@@ -24,7 +24,8 @@ PACKAGES = (
     "gymnasium-robotics", "craftax",
 )  # fmt: skip
 
-
+ROOT = Path(__file__).parents[2]
+"""The folder that holds the code: a checkout, or the site-packages of an installed copy."""
 Place = Annotated[str, StringConstraints(min_length=1, max_length=4096)]
 """A path in a file."""
 
@@ -89,18 +90,28 @@ def provenance() -> dict[str, Any]:
     """The provenance of what this process makes, for its ``meta.json``."""
     import jax
 
-    try:
-        here = Path(__file__).parent
-        command = ["git", "describe", "--always", "--dirty", "--abbrev=12"]
-        commit = subprocess.run(command, cwd=here, capture_output=True, text=True, check=True)
-        revision = commit.stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        revision = "unknown"
     return {
         "command": [Path(sys.executable).name, *sys.orig_argv[1:]],
-        "revision": revision,
+        "revision": revision(),
         "versions": versions(),
         "devices": [str(device) for device in jax.devices()],
         "device_kinds": sorted({device.device_kind for device in jax.devices()}),
         "cpu_count": os.cpu_count(),
     }
+
+
+def revision(root: Path = ROOT) -> str:
+    """The commit of the code, with ``-dirty`` after it if files were changed since; ``unknown`` for an
+    installed copy, also where its environment lies within another repository."""
+
+    def git(*words: str) -> str:
+        command = ["git", *words]
+        done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
+    try:
+        if not os.path.samefile(git("rev-parse", "--show-toplevel"), root):
+            return "unknown"
+        return git("describe", "--always", "--dirty", "--abbrev=12")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
