@@ -191,6 +191,10 @@ class Registry(Generic[Record]):
                 found.append(self.find(name))
         return found
 
+    def loaded(self) -> list[Record]:
+        """The records that were found by their places so far."""
+        return list(self._loaded.values())
+
     def find(self, name: str) -> Record:
         """The record of a name, which may also be a place ``module:attribute``.
 

@@ -43,6 +43,7 @@ def of_adaptation(
     judgements = 1 + ceil(config.episodes / config.eval_every)
     judged = judgements * (judged_episodes(to_json(config), world) or 1)
     rate = seconds_per_episode(config.env, method)
+    num_bytes = log_bytes(env, lanes, config.episodes, config.keep_actions)
     rows = [
         ("searches", f"{num} tasks x {config.seeds} seeds x {_num_variants(config)} variants"),
         (
@@ -51,7 +52,7 @@ def of_adaptation(
         ),
         ("steps", f"at most {lanes * (config.episodes + judged) * env.spec.horizon:,}"),
         ("network", f"{_num_weights(policy.params):,} weights"),
-        ("memory", f"{log_bytes(env, lanes, config.episodes) / 1e6:,.0f} MB of results at most"),
+        ("memory", f"{num_bytes / 1e6:,.0f} MB of results at most"),
         (
             "CPU time",
             _cpu_time(None if rate is None else rate * lanes * (config.episodes + judged)),

@@ -12,21 +12,21 @@ import numpy as np
 from envs.episodes import segment_length
 from envs.errors import UsageError
 from mgpo_jax.network_configs import TransformerConfig
-from mgpo_jax.policy import LoadedPolicy, transformer_policy
+from mgpo_jax.policy import LoadedPolicy, prepared_policy
 from mgpo_jax.prompts import Prompt, prompt_of
 from mgpo_jax.rollout import act
 
 
 @cache
 def _compiled(config: TransformerConfig) -> tuple[Any, Any]:
-    """Jitted prefill and decode with the parameters as arguments, so that policies of one config share
-    them."""
+    """Jitted prefill and decode with the prepared parameters as arguments, so that policies of one config
+    share them."""
 
     def prefill(params: Any, prompt: Prompt, obs: jax.Array) -> Any:
-        return transformer_policy(config, params).prefill(prompt, obs)
+        return prepared_policy(config, params).prefill(prompt, obs)
 
     def decode(params: Any, carry: Any, action: jax.Array, obs: jax.Array) -> Any:
-        return transformer_policy(config, params).decode(carry, action, obs)
+        return prepared_policy(config, params).decode(carry, action, obs)
 
     return jax.jit(prefill), jax.jit(decode)
 
@@ -53,7 +53,7 @@ class Actor:
         self, policy: LoadedPolicy, goals: Prompt | Any, greedy: bool = True, seed: int = 0
     ) -> None:
         self.config = policy.config
-        self._functions = policy.policy
+        self._grow = prepared_policy(policy.config, None).grow
         self._key = jax.random.key(seed)
         self._greedy = jnp.asarray(greedy)
         params = policy.config.prepared(policy.params)  # once, not at every step
@@ -72,9 +72,10 @@ class Actor:
     def prompt(self, goals: Prompt | Any) -> None:
         slots = self.config.max_prompt_length
         prompt = goals if isinstance(goals, Prompt) else prompt_of(goals, slots)
-        if prompt.goals.shape != (slots, self.config.goal_dim):
+        wanted = (slots, self.config.goal_dim)
+        if prompt.goals.shape != wanted:
             raise UsageError(
-                f"the policy takes goals of {self.config.goal_dim} numbers, found a prompt of shape "
+                f"the policy takes prompts of shape {list(wanted)} (goals, numbers in a goal), found "
                 f"{list(prompt.goals.shape)}"
             )
         self._prompt = prompt
@@ -105,7 +106,7 @@ class Actor:
             # As in the episode loop, the cache grows by several steps at a time, since each size is
             # compiled.
             self._room = min(segment_length(horizon), horizon - self._step)
-            self._carry = self._functions.grow(self._carry, self._room)
+            self._carry = self._grow(self._carry, self._room)
         distribution, self._carry = self._decode(self._carry, self._action, self._checked(obs))
         self._step, self._room = self._step + 1, self._room - 1
         return self._choose(distribution)

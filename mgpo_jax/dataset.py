@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from envs.base import ArraySpec, Box, Discrete, EnvSpec, Trajectory
-from envs.errors import DataError, shown
+from envs.errors import DataError, UsageError, shown
 from envs.registry import WORLDS
 from mgpo_jax.archives import read_arrays
 from mgpo_jax.array_fields import ArrayField, Sizes
@@ -349,7 +349,7 @@ def plan_batches(
     it.
     """
     if batch_size % part_size:
-        raise ValueError(f"batch_size {batch_size} is not a multiple of part_size {part_size}")
+        raise UsageError(f"batch_size {batch_size} is not a multiple of part_size {part_size}")
     parts_per_batch = batch_size // part_size
     longest = int(dataset.lengths.max())
     pool_index, offset = divmod(first_step, pool_steps)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from envs.base import Environment, Episode, Task
-from envs.errors import DataError, NotAvailableError
+from envs.errors import DataError, NotAvailableError, UsageError
 from mgpo_jax.adaptation import (
     CHECK_RETURNS,
     Judged,
@@ -24,6 +24,7 @@ from mgpo_jax.network_configs import TransformerConfig
 from mgpo_jax.policy import LoadedPolicy, check_fits, transformer_policy
 from mgpo_jax.rollout import Query, rollout
 from mgpo_jax.sharding import fetch, replicate, split
+from mgpo_jax.tasks import num_tasks
 from mgpo_jax.transformer import GoalTransformer
 
 
@@ -42,6 +43,7 @@ def evaluate(
     those of ``evaluate_fully``, which returns more.
 
     Raises:
+      UsageError: if the queries are not for as many tasks.
       DataError: if the policy was trained for another world, or a return is not finite.
     """
     judged = evaluate_fully(env, policy, tasks, queries, episodes=episodes, seed=seed)
@@ -72,6 +74,7 @@ def evaluate_fully(
       ``achieved`` [S, N, M].
 
     Raises:
+      UsageError: if the queries are not for as many tasks.
       DataError: if the policy was trained for another world, or a return is not finite.
     """
     run = partial(_measurement, num_episodes=episodes)
@@ -104,6 +107,7 @@ def uncertainty(
       Numpy arrays [S, N].
 
     Raises:
+      UsageError: if the queries are not for as many tasks.
       DataError: if the policy was trained for another world, or a return is not finite.
     """
     return _run_queries(_uncertainty, env, policy, tasks, queries, seed)
@@ -146,6 +150,11 @@ def _run_queries(
     """
     check_fits(policy.config, env.spec)
     seeds, num = queries.prompt.mask.shape[:2]
+    if num_tasks(tasks) != num:
+        raise UsageError(
+            f"there are {num_tasks(tasks)} tasks, and queries for {num}; the leaves of queries must be "
+            "[S, N, ..] for N tasks"
+        )
     grid = Grid(variants=1, seeds=seeds, tasks=num)
     layout = lay_out(env, grid.size, cache_bytes(policy.config))
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), queries)

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from envs.errors import UsageError
 from envs.registry import Registry
 
 if TYPE_CHECKING:
@@ -123,5 +124,15 @@ KINDS: Registry[Kind] = Registry(
 
 
 def kind_of(config: NetworkConfig) -> Kind:
-    """The kind that a network's config belongs to."""
-    return next(kind for kind in KINDS.usable() if kind.load().config is type(config))
+    """The kind that a network's config belongs to.
+
+    Raises:
+      UsageError: if no kind that is registered, or was found by its place, has such networks.
+    """
+    for kind in (*KINDS.usable(), *KINDS.loaded()):
+        if kind.load().config is type(config):
+            return kind
+    raise UsageError(
+        f"no kind of network has the config {type(config).__name__}; register the kind, or name it by its "
+        "place first"
+    )

@@ -13,9 +13,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 from annotated_types import Ge, Gt, Le
 
-from envs.errors import UsageError
+from envs.errors import DataError, UsageError
 from envs.registry import Judgement, Registry, World
 from mgpo_jax.kinds import MULTI_GOAL, kind_of
 from mgpo_jax.settings import (
@@ -23,6 +24,7 @@ from mgpo_jax.settings import (
     NumGoals,
     Positive,
     check_settings,
+    flag,
     static,
 )
 
@@ -144,7 +146,7 @@ def foreign_setting(name: str, method: Method) -> UsageError:
         if name in {field.name for field in dataclasses.fields(other.hyper)}
     ]
     hint = f"; it belongs to {', '.join(having)}" if having else ""
-    return UsageError(f"--{name.replace('_', '-')} is not a setting of {method.name}{hint}")
+    return UsageError(f"{flag(name)} is not a setting of {method.name}{hint}")
 
 
 def split_hyper(hypers: Sequence[Any]) -> tuple[Any, dict[str, list[int | float]]]:
@@ -159,7 +161,7 @@ def split_hyper(hypers: Sequence[Any]) -> tuple[Any, dict[str, list[int | float]
     first = hypers[0]
     numbers: dict[str, list[int | float]] = {}
     for field in dataclasses.fields(first):
-        values = [getattr(hyper, field.name) for hyper in hypers]
+        values = [_plain(getattr(hyper, field.name)) for hyper in hypers]
         numeric = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
         if numeric and not field.metadata.get("static"):
             numbers[field.name] = values
@@ -168,6 +170,11 @@ def split_hyper(hypers: Sequence[Any]) -> tuple[Any, dict[str, list[int | float]
                 f"{field.name} cannot be swept, because it changes the compiled program"
             )
     return with_numbers(first, dict.fromkeys(numbers, 0)), numbers
+
+
+def _plain(value: Any) -> Any:
+    """A numpy scalar as a number of Python; any other value unchanged."""
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def with_numbers(hyper: Any, numbers: Mapping[str, Any]) -> Any:
@@ -332,7 +339,10 @@ GCBC = Method(
 
 def policy_kind(name: str) -> str:
     """The kind of network that a method starts from; for an unknown name, the multi-goal policy."""
-    return METHODS.find(name).policy if name in METHODS.names() else MULTI_GOAL
+    try:
+        return METHODS.known(name, "the results").policy
+    except DataError:
+        return MULTI_GOAL
 
 
 def register(method: Method) -> Method:

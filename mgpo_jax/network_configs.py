@@ -14,8 +14,8 @@ import jax.numpy as jnp
 from annotated_types import Ge, Gt, Le, MaxLen
 from jaxtyping import Array, Float, Int, Shaped
 
-from envs.base import EnvSpec, ObsLayout
-from envs.errors import UsageError, nearest
+from envs.base import ArraySpec, EnvSpec, ObsLayout
+from envs.errors import UsageError, nearest, shown
 from envs.registry import Encoder
 from mgpo_jax.distributions import HEADS
 from mgpo_jax.schema import STRICT
@@ -23,6 +23,11 @@ from mgpo_jax.settings import ENCODERS, NumGoals, NumLayers, Share, TokensPerSte
 
 OBS_LIMIT = 5.0  # standardized observations are clipped to this many standard deviations
 Size = Annotated[int, Ge(1), Le(1_000_000)]
+DTYPES = (
+    "bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64",
+    "float16", "float32", "float64",
+)  # fmt: skip
+"""The dtypes that observations may have."""
 
 
 @dataclass(frozen=True)
@@ -166,3 +171,37 @@ def _layout_for(encoder: Encoder, spec: EnvSpec) -> ObsLayout | None:
             f"{said}; choose another encoder"
         )
     return spec.layout
+
+
+def network_fault(config: NetworkConfig) -> str | None:
+    """What is wrong with a network's config, beyond types and ranges; None if nothing is."""
+    if config.head not in HEADS:
+        return f"head must be one of {', '.join(HEADS)}, found {shown(config.head)}"
+    if config.encoder not in (known := ENCODERS.names()):
+        return f"encoder must be one of {', '.join(known)}, found {shown(config.encoder)}"
+    if config.obs_dtype not in DTYPES:
+        return f"obs_dtype must be one of {', '.join(DTYPES)}, found {shown(config.obs_dtype)}"
+    if isinstance(config, TransformerConfig) and config.embed_dim % config.num_heads:
+        return f"num_heads must divide embed_dim {config.embed_dim}, found {config.num_heads}"
+    size = ArraySpec(config.obs_shape, config.obs_dtype).size
+    for name in ("obs_mean", "obs_std"):
+        if len(getattr(config, name)) not in (0, size):
+            return f"{name} must hold {size} numbers or none, found {len(getattr(config, name))}"
+    return _layout_fault(config)
+
+
+def _layout_fault(config: NetworkConfig) -> str | None:
+    """What is wrong with the layout of observations in a network's config; None if nothing is."""
+    layout = config.obs_layout
+    encoder = ENCODERS.find(config.encoder)
+    if not encoder.uses_layout:
+        return None if layout is None else f"obs_layout does not apply to encoder {config.encoder}"
+    if layout is None:
+        return f"obs_layout must not be null with encoder {config.encoder}"
+    if config.obs_mean:
+        return (
+            f"obs_mean must be empty with encoder {config.encoder}, whose inputs are codes rather than "
+            "quantities"
+        )
+    said = encoder.fault(layout, config.obs_shape)
+    return said and f"obs_layout {said}"

@@ -77,8 +77,18 @@ def check_fits(config: NetworkConfig, spec: EnvSpec, who: str = "the policy") ->
 
 def transformer_policy(config: TransformerConfig, params: Any) -> Policy:
     """The pre-trained multi-goal Transformer as a policy; the carry is its KV cache."""
+    return prepared_policy(config, config.prepared(params), params)
+
+
+def prepared_policy(config: TransformerConfig, acting: Any, params: Any = None) -> Policy:
+    """The same policy from parameters that are prepared for acting (``Encoder.prepare``).
+
+    Args:
+      config: the config of the network.
+      acting: the prepared parameters.
+      params: the parameters themselves, which only ``score`` needs.
+    """
     network = GoalTransformer(config)
-    acting = config.prepared(params)
 
     def prefill(prompt: Any, obs: Any) -> Any:
         return network.apply(acting, prompt, obs, method="prefill")

@@ -22,13 +22,12 @@ import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 from pydantic import BaseModel
 
-from envs.base import ArraySpec, EnvSpec
-from envs.errors import DataError, UsageError, shown
+from envs.base import EnvSpec
+from envs.errors import DataError, UsageError
 from envs.registry import World, find
 from mgpo_jax.archives import array_names, read_arrays
 from mgpo_jax.array_fields import ArrayField
 from mgpo_jax.claims import claimed, cleaned_on_exit
-from mgpo_jax.distributions import HEADS
 from mgpo_jax.files import (
     PLACE,
     TEMPORARY,
@@ -40,12 +39,12 @@ from mgpo_jax.files import (
     write_json,
 )
 from mgpo_jax.kinds import KINDS, MULTI_GOAL, kind_of
-from mgpo_jax.network_configs import NetworkConfig, TransformerConfig
+from mgpo_jax.network_configs import NetworkConfig, TransformerConfig, network_fault
 from mgpo_jax.policy import LoadedPolicy, check_fits
 from mgpo_jax.released import released_folder
 from mgpo_jax.schema import STRICT, Json, Name, Sha256, checked_entry, read_document
 from mgpo_jax.seen_goals import MOST_KEPT, SeenGoals
-from mgpo_jax.settings import ENCODERS, Index
+from mgpo_jax.settings import Index
 
 FORMAT = 2  # version 1 had flat observations of size obs_dim
 WEIGHTS = "weights.npz"
@@ -53,11 +52,6 @@ CONFIG = "config.json"
 GOALS = "goals.npz"  # a sample of the goals in the training data
 BEFORE = "before"  # name of the old policy's folder while the new one takes its place
 MEND = "give the folder of another policy, or train it again"
-DTYPES = (
-    "bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64",
-    "float16", "float32", "float64",
-)  # fmt: skip
-"""The dtypes that observations may have."""
 
 
 def save_policy(
@@ -319,43 +313,9 @@ def _read_config(folder: Path) -> _Config:
         raise DataError(f"{path} lacks network.{missing[0]}; {MEND}")
     config = checked_entry(network, learned.config, path, "network", MEND)
     checked_entry(document.made, _Made, path, "made", MEND)
-    if said := _fault(config) or learned.fault(config):
+    if said := network_fault(config) or learned.fault(config):
         raise DataError(f"{path}: network.{said}; {MEND}")
     return _Config(config, document.made, document.sha256)
-
-
-def _fault(config: NetworkConfig) -> str | None:
-    """What is wrong with a network's config, beyond types and ranges; None if nothing is."""
-    if config.head not in HEADS:
-        return f"head must be one of {', '.join(HEADS)}, found {shown(config.head)}"
-    if config.encoder not in (known := ENCODERS.names()):
-        return f"encoder must be one of {', '.join(known)}, found {shown(config.encoder)}"
-    if config.obs_dtype not in DTYPES:
-        return f"obs_dtype must be one of {', '.join(DTYPES)}, found {shown(config.obs_dtype)}"
-    if isinstance(config, TransformerConfig) and config.embed_dim % config.num_heads:
-        return f"num_heads must divide embed_dim {config.embed_dim}, found {config.num_heads}"
-    size = ArraySpec(config.obs_shape, config.obs_dtype).size
-    for name in ("obs_mean", "obs_std"):
-        if len(getattr(config, name)) not in (0, size):
-            return f"{name} must hold {size} numbers or none, found {len(getattr(config, name))}"
-    return _layout_fault(config)
-
-
-def _layout_fault(config: NetworkConfig) -> str | None:
-    """What is wrong with the layout of observations in a network's config; None if nothing is."""
-    layout = config.obs_layout
-    encoder = ENCODERS.find(config.encoder)
-    if not encoder.uses_layout:
-        return None if layout is None else f"obs_layout does not apply to encoder {config.encoder}"
-    if layout is None:
-        return f"obs_layout must not be null with encoder {config.encoder}"
-    if config.obs_mean:
-        return (
-            f"obs_mean must be empty with encoder {config.encoder}, whose inputs are codes rather than "
-            "quantities"
-        )
-    said = encoder.fault(layout, config.obs_shape)
-    return said and f"obs_layout {said}"
 
 
 def _check_blocks(path: Path, config: TransformerConfig) -> None:

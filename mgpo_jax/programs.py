@@ -6,7 +6,8 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import jax
-from jaxtyping import Array
+import jax.numpy as jnp
+from jaxtyping import Array, Int, PRNGKeyArray
 
 from mgpo_jax.adaptation import proceed, start
 from mgpo_jax.lanes import Lanes, Layout, over_lanes
@@ -39,6 +40,15 @@ class Programs(NamedTuple):
     """``(lanes, params) -> state``."""
     advance: Program
     """``((state, lanes), (params, rounds, judging, index of the segment)) -> (state, log, judged)``."""
+
+
+def judge_key(key: PRNGKeyArray, number: int | Int[Array, ""]) -> PRNGKeyArray:
+    """The random key of a judgement, counted from 0, in a search that started from ``key``.
+
+    The search itself goes on with ``split(key)[1]``, which equals ``fold_in(key, 1)``, so judgement 1 has
+    another number.
+    """
+    return jax.random.fold_in(key, jnp.where(number == 1, jnp.iinfo(jnp.int32).max, number))
 
 
 @cache
@@ -76,7 +86,7 @@ def programs_of(
             lane.task,
             num_rounds,
             max_rounds=max_rounds,
-            judge_key=jax.random.fold_in(lane.key, number),
+            judge_key=judge_key(lane.key, number),
             num_judged=setting.judged.episodes,
             judging=judging,
             keep_actions=keep_actions,

@@ -136,10 +136,10 @@ def sweep(
     adapter = method.adapter(setting, policy.params, hypers[0])
     segments, num = _segments(adapter, episodes, eval_every), adapter.episodes_per_round
     grid = Grid(variants=len(hypers), seeds=seeds, tasks=num_tasks(tasks))
-    _check_room(env, grid, episodes)
+    _check_room(env, grid, episodes, keep_actions)
     begin()
     layout = lay_out(env, grid.size, _memory_bytes(env, adapter, tasks))
-    most = longest_part(segments, num * log_bytes(env, grid.size, 1))
+    most = longest_part(segments, num * log_bytes(env, grid.size, 1, keep_actions))
     programs = programs_of(method, setting, fixed, layout, most, keep_actions)
     lanes = grid.lanes(layout, tasks, seed, numbers, ends_early=stop_at is not None)
     lanes, params = split(layout.mesh, lanes), replicate(layout.mesh, policy.params)
@@ -175,11 +175,11 @@ def _check_positive(**numbers: int) -> None:
             raise UsageError(f"{name} must be at least 1, found {value}")
 
 
-def _check_room(env: Environment, grid: Grid, episodes: int) -> None:
+def _check_room(env: Environment, grid: Grid, episodes: int, keep_actions: bool) -> None:
     """Raise ``UsageError`` if there are no tasks, or if the log would not fit into memory."""
     if not grid.size:
         raise UsageError("there are no tasks to adapt to")
-    needed = log_bytes(env, grid.size, episodes)
+    needed = log_bytes(env, grid.size, episodes, keep_actions)
     room = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if needed > room:
         raise UsageError(
@@ -188,9 +188,10 @@ def _check_room(env: Environment, grid: Grid, episodes: int) -> None:
         )
 
 
-def log_bytes(env: Environment, num_lanes: int, episodes: int) -> int:
+def log_bytes(env: Environment, num_lanes: int, episodes: int, keep_actions: bool = False) -> int:
     """Upper bound of the bytes in the log of ``num_lanes`` adaptations, most of them goals and outcomes."""
-    a_step = 2 * 4 * env.spec.goal_dim + 4
+    kept = 4 * env.spec.action_dim if keep_actions and not env.spec.discrete else 0
+    a_step = 2 * 4 * env.spec.goal_dim + 4 + kept
     return num_lanes * episodes * env.spec.horizon * a_step
 
 

@@ -19,6 +19,7 @@ MOST_COMPARED = 20_000  # largest number of goals from which these are chosen
 MOST_TRAJECTORIES = 5_000  # largest number of trajectories from which goals are taken
 AT_ONCE = 128  # number of goals whose distances to all kept ones are computed at once
 SEED = 0  # random seed of the subset of larger data
+ROUNDING = 1e-6  # relative error of ``reach``, which files keep in single precision
 EQUAL = 1e-5  # goals that differ by less, relative to the size of goals, are the same
 
 
@@ -41,9 +42,14 @@ class SeenGoals(NamedTuple):
         ]
         return np.concatenate(nearest).reshape(rows.shape[:-1])
 
+    @property
+    def limit(self) -> float:
+        """The largest distance at which a goal counts as near: ``reach``, with room for rounding."""
+        return self.reach * (1 + ROUNDING)
+
     def far(self, goals: Any) -> Bool[np.ndarray, "..."]:
         """Which goals ``[..., G]`` are far from the training data."""
-        return self.distances(goals) > self.reach
+        return self.distances(goals) > self.limit
 
     def joined(self, other: SeenGoals | None) -> SeenGoals:
         """The union of both samples, for training that continued from another policy."""
@@ -125,7 +131,7 @@ def warning_of_prompts(seen: SeenGoals | None, goals: Any, mask: Any, what: str)
     if seen is None:
         return ""
     distances = np.where(np.asarray(mask), seen.distances(goals), 0.0)
-    far = np.asarray((distances > seen.reach).any(axis=-1))
+    far = np.asarray((distances > seen.limit).any(axis=-1))
     if not far.any():
         return ""
     return (

@@ -239,6 +239,8 @@ def _resumed(
     """
     saved = journal.read("state")
     if saved is None:
+        if journal.read("part000000") is not None and processes.is_first():
+            print("the saved state of the adaptation is lost: it starts again", file=sys.stderr)
         return [], state
     num_parts = int(saved.pop("parts", 0))  # older versions saved whole segments
     records = [journal.read(f"part{i:06}") for i in range(num_parts)]

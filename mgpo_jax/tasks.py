@@ -72,6 +72,7 @@ def evaluation_tasks(
     num_test_tasks: int,
     tested: Environment | None = None,
     seed: int = 0,
+    num_watched: int = 64,
 ) -> Task:
     """Validation tasks, for evaluation during training and for choosing settings; none is a test task.
 
@@ -81,6 +82,7 @@ def evaluation_tasks(
       num_test_tasks: the number of test tasks, which are excluded.
       tested: the world of the test tasks, if that is another world with the same fingerprints [``env``].
       seed: index of one of several sets. Set 0 is used during training; the others share no task with it.
+      num_watched: number of tasks that training evaluates (``pretrain --eval-tasks``), for the other sets.
 
     Raises:
       DataError: if the world has too few tasks.
@@ -88,8 +90,10 @@ def evaluation_tasks(
     drawn = sample_tasks(env, EVAL_SEED + seed, 2 * num)
     forbidden = task_hashes(env, benchmark_tasks(tested or env, num_test_tasks))
     if seed:
-        watched = sample_tasks(env, EVAL_SEED, 2 * num)
-        forbidden = np.concatenate([forbidden, task_hashes(env, watched)])
+        watched = task_hashes(env, sample_tasks(env, EVAL_SEED, 2 * max(num, num_watched)))
+        # Those that training evaluates are the first that are no test tasks.
+        evaluated = watched[~np.isin(watched, forbidden)][:num_watched]
+        forbidden = np.concatenate([forbidden, watched[: 2 * num], evaluated])
     allowed = ~np.isin(task_hashes(env, drawn), forbidden)
     chosen = np.flatnonzero(allowed)[:num]
     if len(chosen) < num:

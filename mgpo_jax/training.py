@@ -9,7 +9,7 @@ resumed from a checkpoint equals an uninterrupted one bit for bit.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -22,12 +22,17 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from envs.base import EnvSpec, Trajectory
-from envs.errors import DataError, UsageError
+from envs.errors import DataError, UsageError, nearest
 from mgpo_jax import processes
 from mgpo_jax.dataset import BatchPlan, Dataset, check_dataset, plan_batches
 from mgpo_jax.kinds import kind_of
 from mgpo_jax.losses import Stats, batch_loss
-from mgpo_jax.network_configs import NetworkConfig, TransformerConfig, network_config
+from mgpo_jax.network_configs import (
+    NetworkConfig,
+    TransformerConfig,
+    network_config,
+    network_fault,
+)
 from mgpo_jax.policy import LoadedPolicy, check_fits
 from mgpo_jax.progress import Progress
 from mgpo_jax.seen_goals import seen_in
@@ -352,8 +357,14 @@ def pretrain(
     """
     config = config or TrainConfig()
     check_dataset(dataset, "dataset", spec)
+    known = [field.name for field in fields(TransformerConfig)]
+    for name in network.keys() - set(known):
+        raise nearest(name, known, "setting of the network")
     if init is None:
         sizes = network_config(spec, **{**RECIPE_NETWORK, **network})
+        check_settings(sizes)
+        if said := network_fault(sizes):
+            raise UsageError(said)
     else:
         check_fits(init.config, spec, "the policy given as init")
         sizes = continued_network(init.config, network, "the policy given as init")

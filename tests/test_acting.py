@@ -91,6 +91,21 @@ def test_an_actor_does_what_the_policy_does_in_the_episode_loop(policy):
     assert envs.episodes.num_segments(ENV.horizon) == 3
 
 
+def test_an_encoder_is_prepared_once(policy, monkeypatch):
+    """Its parameters are not prepared a second time, which an encoder need not allow."""
+    calls = []
+
+    def prepared(config, params):
+        calls.append(params)
+        return params
+
+    monkeypatch.setattr(type(policy.config), "prepared", prepared)
+    actor = Actor(policy, np.zeros((1, 2)))
+    actor.reset(FIRST)
+    actor.act(FIRST)
+    assert len(calls) == 1
+
+
 def test_an_exploring_actor_follows_its_seed(policy):
     task = task_at(TASKS, 0)
     goals = np.asarray(ENV.task_goal(task))[None]
@@ -120,11 +135,11 @@ def test_continuous_actions():
         (np.zeros((4, 2)), r"a list of 1 to 3 goals, .* found shape \[4, 2\]"),
         (np.zeros((0, 2)), "a list of 1 to 3 goals"),
         (np.zeros(2), "a list of 1 to 3 goals"),
-        (np.zeros((2, 3)), r"takes goals of 2 numbers, found a prompt of shape \[3, 3\]"),
+        (np.zeros((2, 3)), r"takes prompts of shape \[3, 2\] .*, found \[3, 3\]"),
         ([[np.nan, 0.0]], "must be finite numbers"),
         (
             Prompt(jnp.zeros((5, 2)), jnp.ones(5, bool)),
-            r"takes goals of 2 numbers, found a prompt of shape \[5, 2\]",
+            r"takes prompts of shape \[3, 2\] .*, found \[5, 2\]",
         ),
     ],
 )

@@ -552,8 +552,17 @@ def test_a_library_call_says_what_does_not_fit(toy: Any) -> None:
     dataset, policy = toy
     with pytest.raises(UsageError, match="--embed-dim 16 contradicts the policy given as init"):
         pretrain(dataset, SPEC, TRAIN, policy, embed_dim=16)
-    with pytest.raises(TypeError, match="wide"):
-        pretrain(dataset, SPEC, TRAIN, policy, wide=16)
+    for init in (policy, None):
+        with pytest.raises(
+            UsageError, match="unknown setting of the network 'embed_dmi'; did you mean"
+        ):
+            pretrain(dataset, SPEC, TRAIN, init, embed_dmi=16)
+    with pytest.raises(UsageError, match="num_heads must divide embed_dim 10, found 4"):
+        pretrain(dataset, SPEC, TRAIN, embed_dim=10)
+    with pytest.raises(UsageError, match=r"num.layers must be at least 1, found 0"):
+        pretrain(dataset, SPEC, TRAIN, num_layers=0)
+    with pytest.raises(UsageError, match="batch_size 8 is not a multiple of part_size 16"):
+        pretrain(dataset, SPEC, TrainConfig(batch_size=8), num_layers=1, embed_dim=8)
     foreign = policy._replace(config=replace(policy.config, goal_dim=5))
     with pytest.raises(DataError, match="the policy given as init has goal_dim 5, toy needs 2"):
         pretrain(dataset, SPEC, TRAIN, foreign)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
@@ -18,8 +18,8 @@ from experiments.store.settings import PretrainConfig
 from mgpo_jax import methods
 from mgpo_jax.baselines.commanded import CommandConfig
 from mgpo_jax.baselines.skills import SkillConfig
-from mgpo_jax.kinds import KINDS, MULTI_GOAL, kind_of
-from mgpo_jax.network_configs import TransformerConfig, world_side
+from mgpo_jax.kinds import KINDS, MULTI_GOAL, Kind, Learned, kind_of
+from mgpo_jax.network_configs import NetworkConfig, TransformerConfig, world_side
 from mgpo_jax.policy_files import load_policy, read_policy, save_policy
 from mgpo_jax.released import released_folder
 from mgpo_jax.settings import TrainConfig
@@ -51,6 +51,21 @@ TRAIN = TrainConfig(
 def test_every_kind_is_tried():
     assert set(TINY) == set(KINDS.names())
     assert {kind_of(config).name for config in TINY.values()} == set(TINY)
+
+
+def test_a_kind_found_by_its_place_is_known_by_its_networks(monkeypatch):
+    @dataclass(frozen=True)
+    class OwnConfig(NetworkConfig):
+        """Of a kind that is registered nowhere."""
+
+    config = OwnConfig(**SIDE)
+    with pytest.raises(UsageError, match="no kind of network has the config OwnConfig"):
+        kind_of(config)
+
+    learned = Learned(config=OwnConfig, init=lambda *args: None, loss=lambda *args: None)
+    own = Kind(name="own", learned=learned, title="Own", watched="nothing")
+    monkeypatch.setitem(KINDS._loaded, "own_kind:KIND", own)
+    assert kind_of(config) is own
 
 
 @pytest.mark.parametrize("name", TINY)

@@ -21,12 +21,13 @@ from mgpo_jax.planning import worths
 from mgpo_jax.planning.maps import plan_map
 from mgpo_jax.planning.orders import MOVED, NONE, moved_goals, plan_order, without
 from mgpo_jax.planning.proposals import changed, random_prompts
-from mgpo_jax.planning.rehearsal import ARRIVES, FAILS, Ahead, Seen, rehearse
+from mgpo_jax.planning.rehearsal import ARRIVES, FAILS, LEAVES, Ahead, Seen, _result, rehearse
 from mgpo_jax.planning.searching import Features
 from mgpo_jax.planning.steering import deficits, lead_along, steer
 from mgpo_jax.planning.table import (
     FAR,
     UNKNOWN,
+    Table,
     add_episode,
     empty_table,
     find_state,
@@ -34,6 +35,7 @@ from mgpo_jax.planning.table import (
     shortest_way,
     steps_from,
     steps_to,
+    way_to,
 )
 from mgpo_jax.planning.worths import (
     SHARE_OF_PROMPT,
@@ -193,6 +195,35 @@ def test_a_full_table_keeps_what_it_has():
     assert find_state(table, WORLD.task_goal(task)) == UNKNOWN
     assert int(jnp.max(table.successors)) == 3
     assert int(steps_from(table, start)[3]) == 3
+
+
+def corridor(num: int) -> Table:
+    """A map of states in a row; action 2 leads to the next one."""
+    table = empty_table(WORLD.spec, num)
+    after = jnp.arange(1, num + 1).at[-1].set(UNKNOWN)
+    return table._replace(successors=table.successors.at[:, 2].set(after), size=jnp.int32(num))
+
+
+def test_no_way_begins_at_an_unknown_state():
+    table = corridor(3)
+    way = partial(way_to, jax.random.key(0), table, end=jnp.int32(2), longest=4)
+    assert int(way(start=jnp.int32(0)).steps) == 2
+    assert int(way(start=jnp.int32(UNKNOWN)).steps) == FAR
+
+
+@pytest.mark.parametrize("num", [200, 400])
+def test_long_rehearsals_are_counted_in_full(num):
+    table, goal = corridor(num), jnp.int32(num - 1)
+    ahead = Ahead(table, jnp.int32(0), goal, steps_to(table, goal), jnp.int32(500))
+    along = jnp.concatenate([jnp.arange(1, num), jnp.full(num, UNKNOWN)])
+    sure = _result(along, jnp.int32(num - 1), ahead)
+    assert (int(sure.ends), int(sure.steps)) == (ARRIVES, num - 1)
+    assert int(sure.strays) == int(sure.farthest) == num - 1
+    left = _result(along.at[5].set(UNKNOWN), jnp.int32(6), ahead)
+    assert int(left.ends) == LEAVES
+    assert int(left.steps) >= num - 1
+    assert (int(left.strays), int(left.farthest)) == (5, 5)
+    assert int(sure.rank) < int(left.rank)
 
 
 @pytest.mark.parametrize("index", range(6))

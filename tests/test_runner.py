@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache, partial
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -25,9 +26,10 @@ from mgpo_jax.lanes import cache_bytes, lanes_together, lay_out
 from mgpo_jax.methods import GCBC, UCB, Method, NoHyper, UcbHyper
 from mgpo_jax.network_configs import network_config
 from mgpo_jax.policy import LoadedPolicy
+from mgpo_jax.programs import judge_key
 from mgpo_jax.prompts import Prompt, single_goal
 from mgpo_jax.rollout import Query, rollout
-from mgpo_jax.runner import adapt, sweep
+from mgpo_jax.runner import adapt, log_bytes, sweep
 from mgpo_jax.settings import NotNegative
 from mgpo_jax.tasks import sample_tasks, task_at
 from mgpo_jax.transformer import GoalTransformer
@@ -369,7 +371,7 @@ def test_the_episodes_that_judge_are_those_of_play(tasks):
         query = Query(prompt, jnp.zeros((), bool), jnp.float32(0.5))
         lane_key = jax.random.split(jax.random.key(0), 2)[index]
         for when in range(2):
-            key = jax.random.fold_in(lane_key, when)
+            key = judge_key(lane_key, when)
             episodes = play(key, env, policy, task, query, 5)
             assert isinstance(episodes.return_, np.ndarray)
             np.testing.assert_allclose(
@@ -399,7 +401,7 @@ def test_named_goals_are_counted_in_judging_episodes():
         query = Query(single_goal(env.task_goal(task), 3), jnp.zeros((), bool))
         lane_key = jax.random.split(jax.random.key(0), 3)[index]
         for when in range(2):
-            played = play(jax.random.fold_in(lane_key, when), env, policy, task, query, 20)
+            played = play(judge_key(lane_key, when), env, policy, task, query, 20)
             last = played.trajectory.length - 1
             ends = played.trajectory.outcomes[np.arange(20), last, :3]
             np.testing.assert_allclose(
@@ -411,6 +413,27 @@ def test_named_goals_are_counted_in_judging_episodes():
     assert again.achieved.shape == (1, 3, 3)
     np.testing.assert_allclose(again.achieved, outcome.eval_achieved[:, :, 0], atol=0.4)
     assert evaluate_fully(GRID, policy, grid_tasks, best, episodes=2).achieved is None
+    few = jax.tree.map(lambda leaf: leaf[:2], grid_tasks)
+    with pytest.raises(UsageError, match="there are 2 tasks, and queries for 3"):
+        evaluate_fully(GRID, policy, few, best, episodes=2)
+
+
+def test_judging_episodes_have_keys_of_their_own():
+    """None is the key with which the search goes on, whose splits are the keys of its episodes."""
+    key = jax.random.key(7)
+    search = jax.random.key_data(jax.random.split(key)[1])
+    found = [jax.random.key_data(judge_key(key, number)) for number in range(5)]
+    assert not any((data == search).all() for data in found)
+    assert len({tuple(data.tolist()) for data in found}) == 5
+    assert (found[3] == jax.random.key_data(jax.random.fold_in(key, 3))).all()
+
+
+def test_the_memory_of_a_log_includes_the_actions_that_it_keeps():
+    kitchen = SimpleNamespace(
+        spec=SimpleNamespace(goal_dim=5, horizon=10, discrete=False, action_dim=9)
+    )
+    assert log_bytes(kitchen, 2, 3) == 2 * 3 * 10 * 44
+    assert log_bytes(kitchen, 2, 3, keep_actions=True) == 2 * 3 * 10 * 80
 
 
 @dataclass(frozen=True)

@@ -137,7 +137,7 @@ def test_parts_whose_saving_takes_long_are_saved_at_the_end_of_a_segment(
     assert 1000 - again.left == 2 + 5
 
 
-@pytest.mark.parametrize("damage", ["missing part", "no number of parts"])
+@pytest.mark.parametrize("damage", ["missing part", "missing state", "no number of parts"])
 def test_a_journal_that_does_not_fit_is_not_used(
     damage: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -145,6 +145,8 @@ def test_a_journal_that_does_not_fit_is_not_used(
     journal = Journal(tmp_path / "pieces")
     if damage == "missing part":
         (tmp_path / "pieces" / "part000001.npz").unlink()
+    elif damage == "missing state":
+        (tmp_path / "pieces" / "state.npz").unlink()
     else:
         state = journal.read("state")
         assert state is not None

@@ -210,3 +210,6 @@ def test_numbers_of_numpy_are_numbers() -> None:
     check_settings(numpy)
     with pytest.raises(UsageError, match="--num must be at least 1, found 0"):
         check_settings(replace(numpy, num=np.int64(0)))
+    _, numbers = split_hyper([numpy, replace(numpy, num=np.int64(65))])
+    assert numbers == {"num": [64, 65], "rate": [0.5, 0.5]}
+    assert all(type(value) in (int, float) for values in numbers.values() for value in values)

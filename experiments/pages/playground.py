@@ -72,7 +72,7 @@ def world_data(world: World, policy: LoadedPolicy) -> dict[str, Any]:
 
 def _seen(seen: SeenGoals | None) -> dict[str, Any] | None:
     """The goals of the training as JSON values."""
-    return seen and {"goals": packed({"goals": seen.goals}), "reach": seen.reach}
+    return seen and {"goals": packed({"goals": seen.goals}), "reach": seen.limit}
 
 
 def half_weights(policy: LoadedPolicy) -> dict[str, np.ndarray]:

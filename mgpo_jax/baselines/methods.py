@@ -11,7 +11,7 @@ from mgpo_jax.methods import Method
 from mgpo_jax.settings import NotNegative, Positive, static
 
 Rate = Annotated[float, Ge(0), Le(10)]
-Share = Annotated[float, Ge(0), Le(1)]
+Fraction = Annotated[float, Ge(0), Le(1)]
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class FinetuneHyper:
     warmup_rounds: Annotated[int, Ge(0), Le(10_000)] = 0
     """Number of rounds over which the learning rate of the policy rises to its value, from the first round
     that trains the policy."""
-    discount: Share = 0.98
+    discount: Fraction = 0.98
     """Discount factor per step [0.98]."""
     kl: NotNegative = 0.0
     """Weight of the divergence KL(pi, pi_0) from the pre-trained policy in the loss."""
@@ -66,7 +66,7 @@ class PpoHyper(FinetuneHyper):
     """Largest deviation from 1 of a probability ratio, which is clipped there."""
     epochs: Annotated[int, Ge(1), Le(1_000)] = static(4)
     """Number of gradient steps on the episodes of a round."""
-    gae_lambda: Share = 0.95
+    gae_lambda: Fraction = 0.95
     """Lambda of generalized advantage estimation."""
     value_weight: NotNegative = 0.5
     """Weight of the value loss, the squared error of the values."""
@@ -101,9 +101,9 @@ class PtgmHyper:
     """Learning rate of Adam [1e-3]."""
     batch_size: Annotated[int, Ge(1), Le(65_536)] = static(64)
     """Number of transitions in an update [64]."""
-    discount: Share = 0.95
+    discount: Fraction = 0.95
     """Discount factor per decision [0.95]."""
-    epsilon: Share = 0.1
+    epsilon: Fraction = 0.1
     """Probability with which the high level chooses a random goal [0.1]."""
     kl: NotNegative = 0.5
     """Weight of the divergence from the goal prior in the reward of a decision [0.5]."""
@@ -131,7 +131,7 @@ class SpirlHyper:
     """Learning rate of Adam for actor, critics and alpha [1e-3]."""
     batch_size: Annotated[int, Ge(1), Le(65_536)] = static(256)
     """Number of transitions in an update [256]."""
-    discount: Share = 0.95
+    discount: Fraction = 0.95
     """Discount factor per decision [0.95]."""
     target_interval: Annotated[int, Ge(1), Le(1_000_000)] = 10
     """Number of updates between two replacements of the target critics [10]."""

@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from envs.base import Episode
 from mgpo_jax.optimizers.arms import Arms, empty_arms, estimated_returns
 from mgpo_jax.optimizers.base import PromptOptimizer, SearchSpace
+from mgpo_jax.planning.table import SAME
 from mgpo_jax.planning.trials import is_tried, with_result
 from mgpo_jax.prompts import Prompt, single_goal
 from mgpo_jax.rollout import Query
@@ -30,7 +31,6 @@ MAX_GOALS = 64
 NUM_ARMS = 64
 """Capacity of the table of prompts that were run greedily."""
 NONE = -1
-SAME = 1e-4  # goals whose components all differ by less are the same
 ENOUGH = 1e-4  # tolerance for a return that counts as the largest possible one
 MOVED = 0.1
 """Smallest standard deviation of the noise on the goals of a known order; the largest is three times

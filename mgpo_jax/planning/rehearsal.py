@@ -23,6 +23,7 @@ HOPE = 2
 """Assumed cost, in steps, of an action whose result is unknown, beyond the known number of remaining
 steps."""
 TOGETHER = 8  # rehearsals that run in one batch: their KV caches fit into the cache of a CPU core
+_UNREACHED = 256  # smallest number of steps that states without a known way to the goal count as
 # A rank packs three numbers in base 1024, most significant first: the expected steps, the steps left at the
 # best moment, and for how long the rehearsal kept to a shortest path.
 _DIGITS = 1024
@@ -135,7 +136,9 @@ def _result(way: Int[Array, "T"], length: Int[Array, ""], ahead: Ahead) -> Rehea
     states = jnp.concatenate([ahead.start[None], way])
     steps = jnp.arange(len(states))
     known = (steps <= length) & (states != UNKNOWN)
-    left = jnp.minimum(ahead.left[states], _DIGITS // 4)
+    # States from which no way is known count as at least as far as every other.
+    unreached = jnp.maximum(_UNREACHED, jnp.max(jnp.where(ahead.left < FAR, ahead.left, 0)))
+    left = jnp.minimum(ahead.left[states], unreached)
     last = jnp.sum(known) - 1
     arrives = states[last] == ahead.goal
     leaves = ~arrives & (states[length] == UNKNOWN)

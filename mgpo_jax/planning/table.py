@@ -20,7 +20,7 @@ UNKNOWN = -1
 """Index of an unknown state: the result of an untried action, and the padding after the end of a path."""
 FAR = 1_000_000
 """Number of steps to a state that no known path leads to."""
-SAME = 1e-4  # goals that differ by less are the same state
+SAME = 1e-4  # goals whose components all differ by less are the same
 
 
 class Table(NamedTuple):
@@ -190,7 +190,8 @@ class Way(NamedTuple):
     @property
     def steps(self) -> Int[Array, ""]:
         """The number of steps of the path; ``FAR`` if no path is known."""
-        return jnp.where(self.end == UNKNOWN, FAR, self.left[self.start])
+        unknown = (self.start == UNKNOWN) | (self.end == UNKNOWN)
+        return jnp.where(unknown, FAR, self.left[self.start])
 
 
 def way_to(
