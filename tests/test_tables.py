@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from test_architecture import call_without_jax
 import envs.kitchen
 from envs.errors import DataError, MissingExtraError, UsageError
 from envs.registry import WORLDS
+from examples import over_time
 from experiments.store.paper import paper_final
 from experiments.store.result_files import load_results, save_results
 from experiments.store.results import Results
@@ -152,6 +154,20 @@ def test_the_published_table_is_that_of_the_results(
     folders = [Path("results", world, method) for world in worlds for method in methods]
     main(TableConfig(runs=tuple(folder for folder in folders if folder.exists())))
     assert capsys.readouterr().out == Path("results/table.md").read_text()
+
+
+def test_the_published_tables_over_time_are_those_of_the_results(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Each stands below the command that prints it."""
+    text = (ROOT / "docs/results.md").read_text()
+    shown = re.findall(r"    python -m examples.over_time ((?:.|\\\n)+?)\n\n((?:\|.*\n)+)", text)
+    assert len(shown) == 3
+    for words, wanted in shown:
+        line = "echo " + words.replace("\\\n", " ")
+        folders = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=True)
+        over_time.main([ROOT / folder for folder in folders.stdout.split()])
+        assert capsys.readouterr().out == wanted
 
 
 def test_a_table_needs_no_jax(with_parts: Path) -> None:
