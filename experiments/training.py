@@ -39,6 +39,7 @@ from mgpo_jax.checkpoint import (
 from mgpo_jax.claims import claimed
 from mgpo_jax.dataset import BatchPlan, Dataset, spec_of
 from mgpo_jax.files import remove_unfinished, to_json, written
+from mgpo_jax.kinds import KINDS
 from mgpo_jax.manifest import read_facts
 from mgpo_jax.network_configs import world_side
 from mgpo_jax.policy_files import save_policy
@@ -219,7 +220,7 @@ def _train_and_save(run: Run, go_on: str) -> None:
     seen = seen_in(run.fit, run.init.seen_goals if run.init else None)
     save_policy(policy, run.network, state.params, made, seen)
     with written(folder / runs.PICTURE) as picture:
-        training_curve(metrics.rows).savefig(picture)
+        training_curve(metrics.rows, KINDS.find(config.method).watched).savefig(picture)
     print(f"policy written to {policy}", file=sys.stderr)
 
 

@@ -223,7 +223,8 @@ def test_training_curve_shows_what_was_logged():
         {"step": 10, "train/loss": 1.5, "val/loss": 1.6, "eval/initial_return": -6.0},
         {"step": 20, "train/loss": 1.0, "val/loss": 1.2, "eval/initial_return": -4.0},
     ]
-    losses, returns = figures.training_curve(rows).axes
+    losses, returns = figures.training_curve(rows, "a random skill").axes
+    assert [line.get_label() for line in returns.lines] == ["a random skill"]
     curves = [line.get_xydata().tolist() for line in (*losses.lines, *returns.lines)]
     assert curves == [[[10, 1.5], [20, 1.0]], [[10, 1.6], [20, 1.2]], [[10, -6], [20, -4]]]
 

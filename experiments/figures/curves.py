@@ -112,10 +112,14 @@ def performance_profiles(results: Mapping[str, Results], title: str | None = Non
 
 
 @styled
-def training_curve(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Losses and returns during a training, from the rows of ``metrics.jsonl``.
+def training_curve(rows: Sequence[Mapping[str, Any]], watched: str = "initial prompt") -> Figure:
+    """Losses and returns during a training.
 
     The returns are of greedy or sampled episodes, whichever the world's record says.
+
+    Args:
+      rows: the rows of ``metrics.jsonl``.
+      watched: what acts in the episodes of ``eval/initial_return`` (``Kind.watched``).
     """
     steps = [row["step"] for row in rows]
     figure = Figure(figsize=(6.4, 2.4), layout="constrained")
@@ -125,7 +129,7 @@ def training_curve(rows: Sequence[Mapping[str, Any]]) -> Figure:
             "return",
             {
                 "eval/followed_return": "prompt of a demonstration",
-                "eval/initial_return": "initial prompt",
+                "eval/initial_return": watched,
             },
         ),
     )

@@ -224,7 +224,7 @@ def release(run: Finished, folder: Path) -> None:
             if (run.source / "policy" / name).is_file():  # older runs have no goals
                 shutil.copy(run.source / "policy" / name, place / name)
         shutil.copy(run.source / METRICS, place)
-        training_curve(run.rows).savefig(place / "training.png")
+        training_curve(run.rows, run.kind.watched).savefig(place / "training.png")
         if run.kind.name == MULTI_GOAL:
             tasks = benchmark_tasks(run.world.make(), run.world.num_test_tasks)
             save_tasks(place / "tasks.npz", tasks)
