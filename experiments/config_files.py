@@ -34,7 +34,7 @@ def expanded(words: Sequence[str], config_class: type) -> list[str]:
       config_class: the dataclass of the command's settings, for the aliases of its flags.
 
     Raises:
-      UsageError: if ``--config`` has no value.
+      UsageError: if ``--config`` has no value, or the file names code that the command line does not name.
       DataError: if the file is damaged or holds no settings.
     """
     typed = list(itertools.takewhile(lambda word: word != "--", words))
@@ -44,20 +44,11 @@ def expanded(words: Sequence[str], config_class: type) -> list[str]:
     names = _names(config_class)
     given = {names.get(name, name) for name in map(_name_of, typed) if name}
     values = read_document(path, dict[str, Json], "give the config.json of a run")
-    _check_imports(values, given)
-    added = [word for name, value in _settings(values, given) for word in _words(name, value)]
+    added = []
+    for name, value in _settings(values, given):
+        _check_setting(name, value, names.get(name, name))
+        added += _words(name, value)
     return [*typed, *added, *words[len(typed) :]]
-
-
-def _check_imports(values: Mapping[str, Any], given: set[str]) -> None:
-    """Raise ``UsageError`` if the file names code of the user's own that the command line does not name."""
-    for name in sorted(IMPORTED & values.keys() - given):
-        for place in [values[name]] if isinstance(values[name], str) else values[name] or []:
-            if ":" in str(place):
-                raise UsageError(
-                    f"the config file names the code {shown(place)}, and a file never decides what is "
-                    f"imported; if you trust it, add {flag(name)} with this value"
-                )
 
 
 def _file_in(words: Sequence[str]) -> Path | None:
@@ -106,6 +97,34 @@ def _settings(values: Mapping[str, Any], given: set[str]) -> Iterator[tuple[str,
                     "object; remove it from the file"
                 )
             yield name, value
+
+
+def _check_setting(name: str, value: Any, setting: str) -> None:
+    """Check a setting of the file before it becomes words of a command line.
+
+    Args:
+      name: its name in the file, which may be an alias.
+      value: its value.
+      setting: the name of the setting.
+
+    Raises:
+      DataError: if the name or the value could be taken for something else.
+      UsageError: if it names code of the user's own.
+    """
+    members = value if isinstance(value, list) else [value]
+    if not name.isidentifier():
+        raise DataError(f"{shown(name)} in the config file is not the name of a setting; remove it")
+    for member in members:
+        if isinstance(value, list) and str(member).startswith("--"):
+            raise DataError(
+                f"the setting {shown(name)} in the config file holds {shown(member)}, which is a flag; "
+                "remove it"
+            )
+        if setting in IMPORTED and ":" in str(member):
+            raise UsageError(
+                f"the config file names the code {shown(member)}, and a file never decides what is "
+                f"imported; if you trust it, add {flag(setting)} with this value"
+            )
 
 
 def _words(name: str, value: Any) -> list[str]:

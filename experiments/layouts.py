@@ -50,7 +50,8 @@ def measured(layout: str, words: Sequence[str]) -> list[dict[str, Any]]:
     flags = [word for word in flags if not word.startswith(FORCED)] + [f"{FORCED}{devices}"]
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": " ".join(flags)}
     with tempfile.TemporaryDirectory() as place:
-        path, running = Path(place) / "rows.json", []
+        path = Path(place) / "rows.json"
+        running: list[subprocess.Popen] = []
         command = [
             sys.executable,
             "-m",
@@ -70,14 +71,16 @@ def measured(layout: str, words: Sequence[str]) -> list[dict[str, Any]]:
                 "--processes",
                 str(num),
             ]
-        for number, cores in enumerate(_cores(num, devices)):
-            own = ["--process", str(number)] if num > 1 else []
-            process = subprocess.Popen([*command, *own], env=environment, stdout=subprocess.DEVNULL)
-            running.append(process)
-            if cores and hasattr(os, "sched_setaffinity"):
-                os.sched_setaffinity(process.pid, cores)
         try:
             with cleaned_on_exit(partial(_end, running, place)):
+                for number, cores in enumerate(_cores(num, devices)):
+                    own = ["--process", str(number)] if num > 1 else []
+                    process = subprocess.Popen(
+                        [*command, *own], env=environment, stdout=subprocess.DEVNULL
+                    )
+                    running.append(process)
+                    if cores and hasattr(os, "sched_setaffinity"):
+                        os.sched_setaffinity(process.pid, cores)
                 codes = [process.wait() for process in running]
         finally:
             _end(running)

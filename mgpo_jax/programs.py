@@ -46,7 +46,7 @@ def judge_key(key: PRNGKeyArray, number: int | Int[Array, ""]) -> PRNGKeyArray:
     """The random key of a judgement, counted from 0, in a search that started from ``key``.
 
     The search itself goes on with ``split(key)[1]``, which equals ``fold_in(key, 1)``, so judgement 1 has
-    another number.
+    another number. Judgement 0 shares the key of ``Adapter.init``, from which no episode is played.
     """
     return jax.random.fold_in(key, jnp.where(number == 1, jnp.iinfo(jnp.int32).max, number))
 

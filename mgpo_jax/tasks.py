@@ -82,7 +82,8 @@ def evaluation_tasks(
       num_test_tasks: the number of test tasks, which are excluded.
       tested: the world of the test tasks, if that is another world with the same fingerprints [``env``].
       seed: index of one of several sets. Set 0 is used during training; the others share no task with it.
-      num_watched: number of tasks that training evaluates (``pretrain --eval-tasks``), for the other sets.
+      num_watched: number of tasks that training evaluates, which the other sets leave out (default: that of
+        ``pretrain --eval-tasks``).
 
     Raises:
       DataError: if the world has too few tasks.

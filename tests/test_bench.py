@@ -6,20 +6,23 @@ import json
 import math
 import subprocess
 import sys
+import tempfile
+import threading
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 import envs
-from envs.errors import UsageError
+from envs.errors import DataError, UsageError
 from experiments import layouts, measurements
 from experiments.bench import BenchConfig, main
 from experiments.measurements import sequence_flops
 from experiments.store.presets import pretrain_preset
-from mgpo_jax import released
+from mgpo_jax import claims, released
 from mgpo_jax.kinds import kind_of
 from mgpo_jax.network_configs import TransformerConfig
 
@@ -101,9 +104,22 @@ def test_rows_of_baselines_are_per_episode_of_the_search(monkeypatch: pytest.Mon
     assert {tuple(rest) for _, _, *rest in asked} == {(1, 40, 40)}
 
 
-def test_a_bench_that_is_stopped_leaves_no_process_and_no_folder(tmp_path: Path) -> None:
-    process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
-    (tmp_path / "rows").mkdir()
-    layouts._end([process], str(tmp_path / "rows"))
-    assert process.wait(timeout=30) != 0
+def test_a_bench_that_is_stopped_leaves_no_process_and_no_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A signal ends a command without its ``finally`` blocks, after what was registered for that."""
+    started, popen = [], subprocess.Popen
+
+    def sleeping(command: list[str], **options: Any) -> subprocess.Popen:
+        started.append(popen([sys.executable, "-c", "import time; time.sleep(60)"]))
+        if len(started) == 2:
+            assert list(tmp_path.iterdir())
+            threading.Timer(0.1, claims.clean_up).start()
+        return started[-1]
+
+    monkeypatch.setattr(layouts.subprocess, "Popen", sleeping)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with pytest.raises(DataError, match="failed with the layout 2x1"):
+        layouts.measured("2x1", [])
+    assert all(process.poll() is not None for process in started)
     assert not list(tmp_path.iterdir())

@@ -90,6 +90,25 @@ def test_a_file_never_decides_what_is_imported(tmp_path: Path) -> None:
         parse(ReproduceConfig, ["table1", "--config", str(path)])
 
 
+@pytest.mark.parametrize(
+    ("content", "error", "says"),
+    [
+        ('{"bandit": "evil:METHOD"}', UsageError, "names the code 'evil:METHOD'"),  # an alias
+        ('{"data": {"env": "evil:WORLD"}}', UsageError, "names the code 'evil:WORLD'"),
+        ('{"hyper": {"method": "evil:METHOD"}}', UsageError, "names the code 'evil:METHOD'"),
+        ('{"env=evil:WORLD": true}', DataError, "is not the name of a setting"),
+        ('{"seeds": [1, "--env=evil:WORLD"]}', DataError, "which is a flag"),
+        ('{"env": 5}', UsageError, "unknown world '5'"),
+    ],
+)
+def test_no_part_of_a_file_is_taken_for_another_flag(
+    tmp_path: Path, content: str, error: type[Exception], says: str
+) -> None:
+    (tmp_path / "config.json").write_text(content)
+    with pytest.raises(error, match=says):
+        parse(AdaptConfig, ["--config", str(tmp_path / "config.json")], adapt_default)
+
+
 def test_a_flag_without_its_file() -> None:
     for words in (["--config"], ["--config", "--seeds", "2"]):
         with pytest.raises(UsageError, match="--config needs a value"):

@@ -418,8 +418,8 @@ def test_named_goals_are_counted_in_judging_episodes():
         evaluate_fully(GRID, policy, few, best, episodes=2)
 
 
-def test_judging_episodes_have_keys_of_their_own():
-    """None is the key with which the search goes on, whose splits are the keys of its episodes."""
+def test_no_judgement_has_the_key_of_the_search():
+    """Its splits are the keys of the episodes of the search."""
     key = jax.random.key(7)
     search = jax.random.key_data(jax.random.split(key)[1])
     found = [jax.random.key_data(judge_key(key, number)) for number in range(5)]

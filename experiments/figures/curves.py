@@ -112,7 +112,7 @@ def performance_profiles(results: Mapping[str, Results], title: str | None = Non
 
 
 @styled
-def training_curve(rows: Sequence[Mapping[str, Any]], watched: str = "initial prompt") -> Figure:
+def training_curve(rows: Sequence[Mapping[str, Any]], watched: str) -> Figure:
     """Losses and returns during a training.
 
     The returns are of greedy or sampled episodes, whichever the world's record says.
