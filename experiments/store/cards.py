@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax
 
 import envs
+from envs.base import Environment
 from envs.errors import DataError, UsageError, printable, shown
 from envs.registry import WORLDS, World
 from experiments.demonstrators import find_demonstrator
