@@ -367,7 +367,7 @@ def test_the_inventory_counts_prices_and_doubts(tmp_path: Path) -> None:
     assert rows["table2"][3] == ""
     assert rows["table1"][1] == "6 of 11"  # all that learn; the others act for next to nothing
     assert float(rows["table1"][3]) < 1
-    # Of SPiRL and PTGM nothing is published in the larger mazes that tells a price.
+    # Of PTGM nothing is published in the larger mazes that tells a price.
     larger = rows_of("maze30")["table1"]
     assert re.fullmatch(r"\d+\.\d \+ \?", larger[3])
     # PPO and REINFORCE have one published seed each. They price three seeds of PPO and of its careful form.
@@ -397,7 +397,7 @@ def test_prices_are_those_of_relatives() -> None:
     assert rate("maze15", methods.find("ucb")) == pytest.approx(ucb)
     similar = [rate("gridworld", methods.find(name)) for name in ("reinforce", "ppo")]
     assert rate("gridworld", methods.find("ppo-careful")) == pytest.approx(sum(similar) / 2)
-    assert rate("maze30", methods.find("spirl")) is None
+    assert rate("maze30", methods.find("ptgm")) is None
     assert rate("gridworld", methods.find("gcbc")) == min(
         1 / read_summary(path)["episodes_per_cpu_second"]
         for path in Path("results/gridworld").iterdir()
