@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache, partial
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -429,11 +428,11 @@ def test_no_judgement_has_the_key_of_the_search():
 
 
 def test_the_memory_of_a_log_includes_the_actions_that_it_keeps():
-    kitchen = SimpleNamespace(
-        spec=SimpleNamespace(goal_dim=5, horizon=10, discrete=False, action_dim=9)
-    )
-    assert log_bytes(kitchen, 2, 3) == 2 * 3 * 10 * 44
-    assert log_bytes(kitchen, 2, 3, keep_actions=True) == 2 * 3 * 10 * 80
+    env = Point(horizon=10)
+    goals, actions = env.spec.goal_dim, env.spec.action_dim
+    assert log_bytes(env, 2, 3) == 2 * 3 * 10 * (8 * goals + 4)
+    assert log_bytes(env, 2, 3, keep_actions=True) == 2 * 3 * 10 * (8 * goals + 4 + 4 * actions)
+    assert log_bytes(MAZE, 2, 3, keep_actions=True) == log_bytes(MAZE, 2, 3)
 
 
 @dataclass(frozen=True)

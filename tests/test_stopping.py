@@ -35,6 +35,7 @@ def stops(outcome, stop_at):
     return np.where(enough.any(-1), enough.argmax(-1), enough.shape[-1] - 1)
 
 
+@pytest.mark.optimized
 @pytest.mark.parametrize("env", [MAZE, Point()])
 def test_a_search_that_ends_early_is_the_same_until_then(env):
     whole = run(env, None)
