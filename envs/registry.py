@@ -229,7 +229,7 @@ class Registry(Generic[Record]):
         """
         if name in self._loaded:
             return self._loaded[name]
-        for record in self._loaded.values():
+        for record in self.loaded():
             if record.name == name:  # type: ignore[attr-defined]
                 return record
         if ":" in name:

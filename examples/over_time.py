@@ -17,6 +17,7 @@ from experiments.store.paper import paper_final
 from experiments.store.rows import read_row
 from experiments.store.statistics import seed_spread
 from experiments.store.tables import table
+from mgpo_jax.settings import flag
 
 EPISODES = (1, 10, 20, 40, 60, 80, 100)
 
@@ -25,7 +26,7 @@ def over_time(folder: Path) -> list[str]:
     """The cells of a run: its method and settings, its mean returns, and the paper's final return."""
     row = read_row(folder)
     method = row.summary["method"]
-    flags = [f"--{name.replace('_', '-')} {value}" for name, value in row.settings.items()]
+    flags = [f"{flag(name)} {value}" for name, value in row.settings.items()]
     one_seed = " (one seed)" if row.summary["num_seeds"] == 1 else ""
     with np.load(folder / "results.npz") as arrays:
         after, returns = arrays["eval_episodes"].tolist(), arrays["eval_returns"].astype(np.float64)
