@@ -6,7 +6,7 @@ import os
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from itertools import count, islice
 from typing import Any, NamedTuple
@@ -27,10 +27,12 @@ from experiments.store.settings import CollectConfig, dataset_folder
 from experiments.store.work import PIECES, long_work
 from mgpo_jax import processes
 from mgpo_jax.claims import check_place
-from mgpo_jax.dataset import Dataset, hash_task, load_dataset, write_dataset
+from mgpo_jax.dataset import Dataset, finish_dataset, hash_task, load_dataset
 from mgpo_jax.files import remove_leftovers
+from mgpo_jax.growing import GrowingFiles
 from mgpo_jax.journal import Journal
 from mgpo_jax.lanes import together
+from mgpo_jax.manifest import read_manifest
 from mgpo_jax.progress import Progress
 from mgpo_jax.sharding import fetch
 from mgpo_jax.tasks import benchmark_tasks, task_hashes
@@ -233,13 +235,17 @@ def _batches(
 def collect(
     env: Environment, demonstrator: Demonstrator, num: int, seed: int, num_test_tasks: int
 ) -> tuple[Dataset, dict[str, Any]]:
-    """Collect demonstrations as ``collected`` does, and return them in every process."""
-    found = collected(env, demonstrator, num, seed, num_test_tasks)
-    if processes.count() == 1:
-        assert found is not None
-        return found
-    arrays = processes.arrays_from_first(lambda: found and found[0].arrays)
-    facts = processes.from_first(lambda: found and found[1])
+    """Collect demonstrations as ``collected`` does.
+
+    Returns:
+      The dataset and facts about it, in every process.
+    """
+    kept: list[dict[str, np.ndarray]] = []
+    own = collected(env, demonstrator, num, seed, num_test_tasks, kept.append)
+    arrays = processes.arrays_from_first(
+        lambda: {name: np.concatenate([part.pop(name) for part in kept]) for name in list(kept[0])}
+    )
+    facts = processes.from_first(lambda: own)
     assert arrays is not None
     assert facts is not None
     return Dataset(**arrays), facts
@@ -251,8 +257,9 @@ def collected(
     num: int,
     seed: int,
     num_test_tasks: int,
+    keep: Callable[[dict[str, np.ndarray]], None],
     journal: Journal | None = None,
-) -> tuple[Dataset, dict[str, Any]] | None:
+) -> dict[str, Any] | None:
     """Collect demonstrations, none of them of a test task.
 
     Failed attempts are repeated with another key, so that a demonstrator that goes through all tasks in
@@ -264,45 +271,46 @@ def collected(
       num: number of demonstrations to keep.
       seed: random seed of the tasks and the demonstrator.
       num_test_tasks: number of test tasks of the world.
+      keep: called in process 0 with the arrays of a ``Dataset``, a batch of demonstrations at a time.
       journal: finished batches; those that it holds are not run again.
 
     Returns:
-      The dataset and facts about it; None in processes other than 0.
+      Facts about the dataset; None in processes other than 0.
 
     Raises:
       DataError: if the demonstrator fails ``MAX_TRIES`` times at one task.
     """
     attempts = _Attempts(env.spec.name)
     forbidden = task_hashes(env, benchmark_tasks(env, num_test_tasks))
-    kept: list[dict[str, np.ndarray]] = []
+    names = demonstrator.variants
+    lengths, returns, variants = [], [], []
     num_test = num_failed = 0
     with Progress(num, "trajectory") as progress:
         batches = _batches(env, demonstrator, num, seed, forbidden, attempts, journal or Journal())
         for record in batches:
             num_failed += int(record.pop("num_failed"))
             num_test += int(record.pop("num_test"))
-            kept.append(record)
+            lengths.append(record["lengths"])
             progress.update(len(record["lengths"]))
+            if processes.is_first():
+                returns.append(record.pop("returns"))
+                variants.append(record["variants"] if names else record.pop("variants"))
+                keep(record)
     if not processes.is_first():
         return None
-    arrays = {name: np.concatenate([part[name] for part in kept]) for name in kept[0]}
-    returns = arrays.pop("returns")
-    names = demonstrator.variants
-    if not names:
-        del arrays["variants"]
-    dataset = Dataset(**arrays)
+    steps = np.concatenate(lengths)
     facts = {
         "tried_again": attempts.num_again,
         "failed_episodes": num_failed,
         "dropped_test_tasks": num_test,
-        "length": _describe(dataset.lengths),
-        "at_horizon": float(np.mean(dataset.lengths == env.spec.horizon)),
-        "hindsight_return": _describe(returns),
+        "length": _describe(steps),
+        "at_horizon": float(np.mean(steps == env.spec.horizon)),
+        "hindsight_return": _describe(np.concatenate(returns)),
     }
-    if dataset.variants is not None:
-        counts = np.bincount(dataset.variants, minlength=len(names))
+    if names:
+        counts = np.bincount(np.concatenate(variants), minlength=len(names))
         facts["variants"] = dict(zip(names, counts.tolist(), strict=True))
-    return dataset, facts
+    return facts
 
 
 def _describe(values: np.ndarray) -> dict[str, Any]:
@@ -352,18 +360,26 @@ def collect_and_save(
     with long_work(folder, asked, provenance(), config.resume, wait, go_on) as work:
         expect_compiling()
         cpu = time.process_time()
-        found = collected(
-            env, demonstrator, config.trajectories, config.seed, world.num_test_tasks, work.journal
+        files = GrowingFiles(work.place)
+        facts = collected(
+            env,
+            demonstrator,
+            config.trajectories,
+            config.seed,
+            world.num_test_tasks,
+            files.append,
+            work.journal,
         )
         cpu = processes.total(time.process_time() - cpu)
-        if found is not None:
-            write_dataset(work.place, found[0], {**made, "versions": versions(), **found[1]})
-    if found is None:
+        if facts is not None:
+            files.finish()
+            finish_dataset(work.place, {**made, "versions": versions(), **facts})
+    if facts is None:
         return
-    dataset, facts = found
+    _, manifest = read_manifest(folder)
     length, return_ = facts["length"]["mean"], facts["hindsight_return"]["mean"]
     print(
-        f"{folder}: {len(dataset)} trajectories, {dataset.lengths.sum()} steps\n"
+        f"{folder}: {manifest.num_trajectories} trajectories, {manifest.num_steps} steps\n"
         f"  mean length {length:.1f}, {100 * facts['at_horizon']:.1f} % at the horizon, "
         f"mean hindsight return {return_:.2f}\n"
         f"  {cpu:.1f} CPU-seconds with compilation",

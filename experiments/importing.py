@@ -20,71 +20,39 @@ from experiments.store.data_settings import ImportConfig
 from experiments.store.provenance import versions
 from mgpo_jax.dataset import finish_mapped
 from mgpo_jax.files import new_folder
+from mgpo_jax.growing import GrowingFiles
 from mgpo_jax.progress import Progress
-
-
-class Appender:
-    """Appends rows to an npy file; ``finish`` writes their number into the header."""
-
-    def __init__(self, path: Path, row: np.ndarray) -> None:
-        self.file = open(path, "wb")  # noqa: SIM115 (closed by finish)
-        self.shape, self.dtype, self.num = row.shape[1:], row.dtype, 0
-        self._write_header()
-        self.start = self.file.tell()
-
-    def _write_header(self) -> None:
-        # The header of an npy file has padding for the first axis to grow.
-        header = {
-            "descr": np.lib.format.dtype_to_descr(self.dtype),
-            "fortran_order": False,
-            "shape": (self.num, *self.shape),
-        }
-        np.lib.format.write_array_header_1_0(self.file, header)
-
-    def append(self, rows: np.ndarray) -> None:
-        self.file.write(np.ascontiguousarray(rows).tobytes())
-        self.num += len(rows)
-
-    def finish(self) -> None:
-        self.file.seek(0)
-        self._write_header()
-        if self.file.tell() != self.start:
-            raise RuntimeError("the header of an npy file has grown")
-        self.file.close()
 
 
 class Writer:
     """Writes trajectories one after the other; all must have the same arrays, shapes and dtypes."""
 
     def __init__(self, place: Path) -> None:
-        self.place, self.files = place, dict[str, Appender]()
+        self.place, self.grown = place, GrowingFiles(place)
         self.lengths: list[int] = []
 
     def add(self, who: str, rows: Rows) -> None:
-        if not self.lengths:
-            self.files = {n: Appender(self.place / f"{n}.npy", a) for n, a in rows.items()}
-        if self.files.keys() != rows.keys():
-            odd = min(self.files.keys() ^ rows.keys())
+        files = self.grown.files
+        if files and files.keys() != rows.keys():
+            odd = min(files.keys() ^ rows.keys())
             raise DataError(
-                f"{who} has {'no ' if odd in self.files else ''}{odd}, unlike those before it; "
+                f"{who} has {'no ' if odd in files else ''}{odd}, unlike those before it; "
                 "log the same arrays in all episodes"
             )
-        for name, array in rows.items():
-            file = self.files[name]
+        for name, file in files.items():
+            array = rows[name]
             if (array.shape[1:], array.dtype) != (file.shape, file.dtype):
                 raise DataError(
                     f"{who}: {name} has rows of {array.dtype}{list(array.shape[1:])}, those before have "
                     f"{file.dtype}{list(file.shape)}; import them one kind at a time"
                 )
-            file.append(array)
+        self.grown.append(rows)
         self.lengths.append(len(rows["actions"]))
 
     def finish(self, manifest: dict[str, Any]) -> None:
         lengths = np.array(self.lengths, np.int32)
-        for file in self.files.values():
-            file.finish()
+        names = [*self.grown.finish(), "lengths"]
         np.save(self.place / "lengths.npy", lengths)
-        names = [*self.files, "lengths"]
         finish_mapped(self.place, names, len(lengths), int(lengths.sum()), manifest)
 
 
@@ -152,14 +120,16 @@ def _manifest(
 ) -> dict[str, Any]:
     """The entries of the manifest, except for hashes and counts."""
     lengths = np.array(writer.lengths)
-    discrete = writer.files["actions"].dtype.kind in "iu"
-    size = 1 if discrete else writer.files["actions"].shape[0]
+    discrete = writer.grown.files["actions"].dtype.kind in "iu"
+    size = 1 if discrete else writer.grown.files["actions"].shape[0]
     known = config.num_actions or (sized_of(source, "num_actions") or [source.num_actions])[0]
     cut = sized_of(source, "cut_in_hindsight")
     if discrete and known is None:
-        writer.files["actions"].file.flush()
+        writer.grown.files["actions"].file.flush()
         path = writer.place / "actions.npy"
-        known = 1 + int(np.fromfile(path, np.int32, offset=writer.files["actions"].start).max())
+        known = 1 + int(
+            np.fromfile(path, np.int32, offset=writer.grown.files["actions"].start).max()
+        )
     stem = config.name or Path(config.source).absolute().stem
     spec = {
         "name": re.sub(r"[^\w.-]", "-", stem).lstrip("-.")[:100] or "data",

@@ -2,8 +2,8 @@
 
 On disk a dataset is a folder with ragged arrays (all trajectories concatenated over time, and their
 lengths) and ``manifest.json``, which says what the data are, how they were made, and their hash. The arrays
-are packed in ``trajectories.npz``, or each has a file of its own that is mapped into memory (see
-``manifest``).
+are packed in ``trajectories.npz``, or, if they are large or imported, each has a file of its own that is
+mapped into memory (see ``manifest``).
 """
 
 from __future__ import annotations
@@ -137,6 +137,26 @@ def write_dataset(
         "num_steps": int(dataset.lengths.sum()),
     }
     write_json(place / MANIFEST, {**facts, **manifest})
+
+
+LARGE = 2 << 30
+"""Number of bytes in memory beyond which collected trajectories are mapped instead of packed."""
+
+
+def finish_dataset(place: Path, manifest: dict[str, Any]) -> None:
+    """Make a dataset of the arrays in the files ``NAME.npy`` of a folder, which may be larger than the
+    memory.
+
+    Up to ``LARGE`` bytes they are packed into one compressed file; larger ones stay as they are and are
+    mapped into memory.
+    """
+    arrays = {path.stem: np.load(path, mmap_mode="r") for path in sorted(place.glob("*.npy"))}
+    if sum(array.nbytes for array in arrays.values()) > LARGE:
+        finish_mapped(place, arrays, len(arrays["lengths"]), len(arrays["actions"]), manifest)
+        return
+    write_dataset(place, Dataset(**arrays), manifest)
+    for name in arrays:
+        (place / f"{name}.npy").unlink()
 
 
 def finish_mapped(

@@ -1,8 +1,8 @@
 """The ``manifest.json`` of a dataset, and the facts about a dataset before it is read. Imports no jax.
 
 There are two formats on disk. Data collected from a demonstrator are packed in ``trajectories.npz``,
-compressed. Imported data have an uncompressed file ``NAME.npy`` for each array, which is mapped into memory
-instead of read, so that such a dataset may be larger than the memory.
+compressed, unless they are large. Large and imported data have an uncompressed file ``NAME.npy`` for each
+array, which is mapped into memory instead of read, so that such a dataset may be larger than the memory.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class Manifest(BaseModel):
 def mend_for(folder: Path) -> str:
     """How to mend a damaged dataset, the end of a message."""
     mapped = (Path(folder) / "actions.npy").exists()
-    return f"remove {folder} and {'import' if mapped else 'collect'} it again"
+    return f"remove {folder} and {'collect or import' if mapped else 'collect'} it again"
 
 
 def read_manifest(folder: Path, mend: str = "") -> tuple[dict[str, Any], Manifest]:

@@ -10,8 +10,10 @@ import pytest
 import envs
 from envs.errors import DataError, UsageError
 from envs.wrappers import Wrapper
-from experiments.datasets import collect
+from experiments.datasets import collect, collect_and_save
 from experiments.demonstrators import find_demonstrator
+from experiments.store.settings import CollectConfig
+from mgpo_jax.dataset import load_dataset
 from mgpo_jax.tasks import benchmark_tasks, task_hashes
 
 WORLD = envs.make("gridworld")
@@ -90,3 +92,20 @@ def test_a_task_that_cannot_be_demonstrated_is_an_error() -> None:
     )
     with pytest.raises(DataError, match=r"failed 20 times at task [0-9]+ of gridworld"):
         collect(WORLD, demonstrator, 500, seed=0, num_test_tasks=50)
+
+
+@pytest.mark.parametrize("large", [False, True])
+def test_what_is_written_is_what_is_collected(tmp_path, monkeypatch, large) -> None:
+    """Also if it is so large that it is mapped into memory."""
+    if large:
+        monkeypatch.setattr("mgpo_jax.dataset.LARGE", 1000)
+    config = CollectConfig(env="gridworld", trajectories=300, seed=3, out=tmp_path / "data")
+    collect_and_save(config)
+    written, manifest = load_dataset(tmp_path / "data", WORLD.spec)
+    dataset, facts = collect(WORLD, EXPERT, 300, seed=3, num_test_tasks=50)
+    assert isinstance(written.obs, np.memmap) == large
+    assert manifest["length"] == facts["length"]
+    assert written.arrays.keys() == dataset.arrays.keys()
+    for name, array in dataset.arrays.items():
+        assert array.dtype == written.arrays[name].dtype
+        np.testing.assert_array_equal(array, written.arrays[name])

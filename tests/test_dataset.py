@@ -19,6 +19,7 @@ from mgpo_jax.dataset import (
     MANIFEST,
     Dataset,
     check_dataset,
+    finish_dataset,
     hash_task,
     load_dataset,
     plan_batches,
@@ -613,6 +614,30 @@ def test_batches_of_a_mapped_dataset_are_bit_for_bit_those_of_one_in_memory(mapp
                 assert one.length.tobytes() == two.length.tobytes()
 
 
+@pytest.mark.parametrize("large", [False, True])
+def test_arrays_in_files_become_a_packed_dataset_or_a_mapped_one_if_they_are_large(
+    tmp_path, monkeypatch, dataset, large
+):
+    """The files of the arrays are gone from a packed dataset, and its hash is that of the same arrays in
+    memory."""
+    num_bytes = sum(array.nbytes for array in dataset.arrays.values())
+    monkeypatch.setattr("mgpo_jax.dataset.LARGE", num_bytes - 1 if large else num_bytes)
+    place = tmp_path / "place"
+    place.mkdir()
+    for name, array in dataset.arrays.items():
+        np.save(place / f"{name}.npy", array)
+    finish_dataset(place, {"env": "toy"})
+    save_dataset(tmp_path / "memory", dataset, {"env": "toy"}, mapped=large)
+    loaded, manifest = load_dataset(place, SPEC)
+    _, wanted = load_dataset(tmp_path / "memory", SPEC)
+    assert manifest == wanted
+    assert isinstance(loaded.obs, np.memmap) == large
+    assert sorted(path.name for path in place.iterdir()) == sorted(
+        path.name for path in (tmp_path / "memory").iterdir()
+    )
+    assert_equal(replace(loaded, lengths=np.array(loaded.lengths)), dataset)
+
+
 def test_what_was_let_go_is_read_again(tmp_path, monkeypatch):
     """Pages that were taken out of memory come back with what they held."""
     monkeypatch.setattr("mgpo_jax.mapped.RESIDENT", 0)
@@ -637,7 +662,9 @@ def test_what_was_let_go_is_read_again(tmp_path, monkeypatch):
 )
 def test_damaged_files_of_a_mapped_dataset_are_refused(mapped, damage, says):
     damage(mapped / "obs.npy")
-    with pytest.raises(DataError, match=rf"{says}.*; remove .*mapped and import it again"):
+    with pytest.raises(
+        DataError, match=rf"{says}.*; remove .*mapped and collect or import it again"
+    ):
         load_dataset(mapped)
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from envs.errors import DataError, UsageError
 from experiments import runtime
-from experiments.importing import Appender, import_dataset
+from experiments.importing import import_dataset
 from experiments.soundness import described, examine
 from experiments.store.data_settings import ImportConfig, check_import
 from mgpo_jax.dataset import load_dataset, save_dataset
@@ -444,16 +444,6 @@ def test_what_is_no_source(source, says):
     Path("empty").mkdir()
     with pytest.raises(UsageError, match=says):
         imported(source)
-
-
-def test_rows_are_appended_to_a_file_that_numpy_reads(tmp_path):
-    rng = np.random.default_rng(0)
-    pieces = [rng.normal(size=(num, 2, 3)).astype(np.float32) for num in (1, 1000, 7)]
-    file = Appender(tmp_path / "rows.npy", pieces[0])
-    for piece in pieces:
-        file.append(piece)
-    file.finish()
-    np.testing.assert_array_equal(np.load(tmp_path / "rows.npy"), np.concatenate(pieces))
 
 
 # The check
