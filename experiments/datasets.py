@@ -6,9 +6,10 @@ import os
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from itertools import count, islice
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -282,7 +283,6 @@ def collected(
     """
     attempts = _Attempts(env.spec.name)
     forbidden = task_hashes(env, benchmark_tasks(env, num_test_tasks))
-    names = demonstrator.variants
     lengths, returns, variants = [], [], []
     num_test = num_failed = 0
     with Progress(num, "trajectory") as progress:
@@ -294,23 +294,31 @@ def collected(
             progress.update(len(record["lengths"]))
             if processes.is_first():
                 returns.append(record.pop("returns"))
-                variants.append(record["variants"] if names else record.pop("variants"))
+                if demonstrator.variants:
+                    variants.append(record["variants"])
+                else:
+                    del record["variants"]
                 keep(record)
     if not processes.is_first():
         return None
-    steps = np.concatenate(lengths)
-    facts = {
+    all_lengths = np.concatenate(lengths)
+    return {
         "tried_again": attempts.num_again,
         "failed_episodes": num_failed,
         "dropped_test_tasks": num_test,
-        "length": _describe(steps),
-        "at_horizon": float(np.mean(steps == env.spec.horizon)),
+        "length": _describe(all_lengths),
+        "at_horizon": float(np.mean(all_lengths == env.spec.horizon)),
         "hindsight_return": _describe(np.concatenate(returns)),
+        **_count_variants(demonstrator.variants, variants),
     }
-    if names:
-        counts = np.bincount(np.concatenate(variants), minlength=len(names))
-        facts["variants"] = dict(zip(names, counts.tolist(), strict=True))
-    return facts
+
+
+def _count_variants(names: Sequence[str], variants: Sequence[np.ndarray]) -> dict[str, Any]:
+    """The manifest's entry on the variants of the world, if it has any."""
+    if not names:
+        return {}
+    counts = np.bincount(np.concatenate(variants), minlength=len(names))
+    return {"variants": dict(zip(names, counts.tolist(), strict=True))}
 
 
 def _describe(values: np.ndarray) -> dict[str, Any]:
@@ -374,8 +382,12 @@ def collect_and_save(
         if facts is not None:
             files.finish()
             finish_dataset(work.place, {**made, "versions": versions(), **facts})
-    if facts is None:
-        return
+    if facts is not None:
+        _report(folder, facts, cpu)
+
+
+def _report(folder: Path, facts: Mapping[str, Any], cpu: float) -> None:
+    """Print what was collected, and the CPU time that it took."""
     _, manifest = read_manifest(folder)
     length, return_ = facts["length"]["mean"], facts["hindsight_return"]["mean"]
     print(
