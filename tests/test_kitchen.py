@@ -22,6 +22,7 @@ import envs
 from envs.errors import MissingExtraError
 from envs.kitchen import NoOpenGLError, extra
 from envs.kitchen.demonstrators import kitchen_demonstrators
+from envs.kitchen.engines import resolve_backend
 from envs.kitchen.env import NONE, SUBTASKS, Kitchen, KitchenState, KitchenTask
 from envs.kitchen.fidelity import jit_for
 from mgpo_jax.sharding import device_mesh
@@ -474,6 +475,24 @@ def test_one_step_of_mjx_is_one_of_native():
     ]
     np.testing.assert_allclose(*after, atol=5e-3)
     assert np.median(np.abs(after[0] - after[1])) < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("device", "model", "engine"),
+    [
+        ("cpu", "reduced", "native"),
+        ("cpu", "stock", "native"),
+        ("gpu", "reduced", "mjx"),
+        ("tpu", "reduced", "mjx"),
+        ("gpu", "stock", "native"),
+    ],
+)
+def test_mjx_is_the_default_on_accelerators_where_it_can_run_the_scene(
+    monkeypatch, device, model, engine
+):
+    monkeypatch.setattr(jax, "default_backend", lambda: device)
+    assert resolve_backend("auto", model) == engine
+    assert {resolve_backend(name, model) for name in ("native", "mjx")} == {"native", "mjx"}
 
 
 def test_accelerators_call_c_through_a_pure_callback(monkeypatch):

@@ -28,9 +28,11 @@ from envs.kitchen.official import (  # noqa: E402
     num_in_turn,
 )
 from envs.official import Own, Played, play  # noqa: E402
+from experiments.store.results import load_results  # noqa: E402
 from mgpo_jax.acting import Actor  # noqa: E402
 from mgpo_jax.policy_files import load_policy  # noqa: E402
 
+RESULTS = Path(__file__).parent.parent / "results"
 HORIZON = 120
 STOCK = Kitchen(name="kitchen-stock", horizon=HORIZON, backend="native", model="stock")
 BURNER, LIGHT, SLIDE, HINGE, MICROWAVE = range(5)
@@ -92,6 +94,21 @@ class TestTheSameIsReached:
         assert "microwave" in own.reached
         assert own.return_ == pytest.approx(theirs.return_)
         assert own._replace(return_=0.0) == theirs._replace(return_=0.0)
+
+    @pytest.mark.parametrize(
+        ("seed", "task", "order"), [(0, 24, (MICROWAVE, LIGHT)), (2, 7, (LIGHT, HINGE))]
+    )
+    def test_by_the_released_policy_under_an_adapted_prompt(self, seed, task, order):
+        """Prompts that UCB found for two test tasks, which solve them in both worlds at the same steps."""
+        results = load_results(RESULTS / "kitchen-stock" / "ucb")
+        names = " and ".join(sorted(SUBTASKS[index] for index in order))
+        told = goal_name(results.task_goals[task])
+        assert sorted(told.split(" and ")) == sorted(names.split(" and "))
+        actor = Actor(load_policy(envs.find("kitchen")), results.best_goals(seed, task))
+        own, theirs = in_both(actor, order)
+        assert own.reached == theirs.reached == tuple(SUBTASKS[index] for index in order)
+        assert own.steps == theirs.steps
+        assert own.return_ == theirs.return_ == 1.0
 
     @pytest.mark.optimized
     def test_to_the_last_bit(self):

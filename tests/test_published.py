@@ -60,7 +60,7 @@ def test_reached_goals_are_those_of_the_replayed_episodes(name):
 
 
 def test_results_of_the_first_format_are_read():
-    results = load_results(RESULTS / "ablations" / "kitchen" / "mixture" / "ucb")
+    results = load_results(Path(__file__).parent / "data" / "results_of_format_1")
     assert results.method == "ucb"
     assert results.actions is None
     assert results.reached is None

@@ -40,7 +40,6 @@ OTHER_SETTINGS = {  # of published results that the paper's number may not stand
     "ablations/maze15/without-prior/ptgm-goal": "kl=0",
     "ablations/gridworld/without-prior/ptgm-goal": "kl=0",
     "ablations/gridworld/spirl-sampled": "judged_by=sample",
-    "ablations/kitchen/mixture/ucb": "policy=..",
     "ablations/maze15/behind-noise/plan-action": "action_noise=0.1",
     "ablations/maze15/behind-noise/plan-full": "num_states=48",
     "ablations/maze15/behind-noise/plan-obs": "obs_noise=0.02",
@@ -51,7 +50,7 @@ OTHER_SETTINGS = {  # of published results that the paper's number may not stand
         for m in ("ucb", "bpe", "explore", "grips", "bbt")
     },
 }
-KITCHEN = RESULTS / "ablations" / "kitchen" / "mixture" / "ucb"  # of the first format
+KITCHEN = Path(__file__).parent / "data" / "results_of_format_1"
 
 
 @pytest.fixture
@@ -176,18 +175,18 @@ def test_a_table_needs_no_jax(with_parts: Path) -> None:
     assert call_without_jax(lines) == ["0|False|"]
 
 
-@pytest.mark.parametrize("name", ["kitchen/ucb", "ablations/kitchen/mixture/ucb"])
-def test_parts_of_older_results_are_counted(name: str) -> None:
+@pytest.mark.parametrize("run", [RESULTS / "kitchen" / "ucb", KITCHEN], ids=["now", "format 1"])
+def test_parts_of_older_results_are_counted(run: Path) -> None:
     """From the tasks and the returns of their single episodes."""
     pytest.importorskip("mujoco")
-    row = read_row(RESULTS / name)
+    row = read_row(run)
     shares = row.summary["part_shares"]
     assert shares is not None
-    np.testing.assert_allclose(shares, counted(RESULTS / name))
+    np.testing.assert_allclose(shares, counted(run))
     assert [num for _, num in shares] == [75, 75, 69, 57, 24]
     found = cells(row)
     assert list(found)[len(HEAD) :] == ["p1", "p2", "p3", "p4", "p5"]
-    if name == "kitchen/ucb":
+    if run != KITCHEN:
         wanted = ["1.00 (75)", "1.00 (75)", "0.94 (69)", "0.81 (57)", "0.62 (24)"]
         assert list(found.values())[len(HEAD) :] == wanted
 
@@ -265,7 +264,7 @@ def test_parts_of_a_place_are_checked_where_they_are_told(with_parts: Path) -> N
 
 
 def test_a_policy_that_was_not_released_is_stated() -> None:
-    row = read_row(RESULTS / "ablations/kitchen/mixture/ucb")
+    row = read_row(KITCHEN)
     assert row.settings == {"policy": "2d3d3ab0106b"}
     assert cells(row)["paper: final"] == ""  # which is that of the released policy
 
