@@ -6,6 +6,7 @@ The two worlds are compared with each other, not with recorded numbers.
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
