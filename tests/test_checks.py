@@ -170,7 +170,77 @@ def moving(self, state, action):
     return after._replace(steps=state.steps + 1), timestep
 
 
+def forged(**fields: Any) -> EnvSpec:
+    """The spec of a track with fields of wrong types, which the type checker of the tests would refuse."""
+    spec = replace(Track.spec)
+    for name, value in fields.items():
+        object.__setattr__(spec, name, value)
+    return spec
+
+
+def sheer(self, state, action):
+    """Returns its state as a tuple with fields of no name."""
+    after, timestep = Track.step(self, state, action)
+    return tuple(after), timestep
+
+
+def nameless(self, state, action):
+    """Returns a dict in place of a time step."""
+    after, timestep = Track.step(self, state, action)
+    return after, timestep._asdict()
+
+
+def fickle(self, key):
+    """Draws another task at every call, whatever the key."""
+
+    def draw(key):
+        return np.int32(1 + next(CALLS) % 5)
+
+    data = jax.random.key_data(key)
+    return jax.pure_callback(
+        draw, jax.ShapeDtypeStruct((), jnp.int32), data, vmap_method="sequential"
+    )
+
+
+def done_at_once(self, key, task):
+    walk, timestep = Track.reset(self, key, task)
+    return walk, timestep._replace(terminated=jnp.ones((), bool))
+
+
+def only_traced(self, state, action):
+    if not isinstance(action, jax.core.Tracer):
+        raise TypeError("a number is no tracer")
+    return Track.step(self, state, action)
+
+
 BROKEN = {
+    "no spec": (changed(spec="track"), r"spec is a str; it must be an envs.EnvSpec"),
+    "actions": (
+        changed(spec=forged(actions=2)),
+        "spec.actions is 2; it must be envs.Discrete or envs.Box",
+    ),
+    "horizon": (changed(spec=forged(horizon=0)), "spec.horizon is 0; it must be an integer"),
+    "goal_dim": (
+        changed(spec=forged(goal_dim=1.5)), r"spec.goal_dim is 1.5; it must be an integer"
+    ),
+    "no time step": (changed(step=nameless), "step returns a dict in second place"),
+    "other fields": (changed(step=sheer), "the state returned by step has different fields from the state"),
+    "no array": (
+        told(lambda s, t, a: {"obs": (t.obs, t.obs)}), r"obs of step is a tuple; it must be an array"
+    ),
+    "fickle tasks": (changed(sample_task=fickle), "sample_task is not pure: the same key drew two"),
+    "goal is no number": (
+        changed(task_goal=lambda self, task: jnp.full((1,), jnp.nan)), "task_goal of sampled task 0 is not"
+    ),
+    "over at reset": (changed(reset=done_at_once), "reset of episode 0 returns an episode that is over"),
+    "seen after the end": (
+        told(lambda s, t, a: {"obs": t.obs + Track().over(s)}),
+        "has a different obs from that at the end of the episode, step [1-8]; terminal states must stay",
+    ),
+    "only under jit": (
+        changed(step=only_traced),
+        "the world works only under jit; without jit it raises TypeError: a number is no tracer",
+    ),
     "no class of a world": (object, r"make\(\) returns a object"),
     "unhashable": (changed(__hash__=None), "cannot be hashed"),
     "range": (
