@@ -347,6 +347,36 @@ def test_sound_worlds_have_no_fault(world: Any) -> None:
     assert "no faults" in str(report)
 
 
+class Balance(Track):
+    """A track whose best return is unknown, and which pays for every step until the end."""
+
+    spec = replace(Track.spec, return_range=(0.0, 8.0))
+
+    def optimal_return(self, task):
+        return jnp.full((), jnp.nan)
+
+    def step(self, state, action):
+        after, timestep = super().step(state, action)
+        paid = jnp.where(self.over(state), 0.0, 1.0)
+        return after, timestep._replace(reward=paid, outcome=-jnp.ones(1))
+
+
+def test_the_last_of_many_rewards_is_no_solution() -> None:
+    report = envs.check_world(record(Balance()))
+    assert report.faults == ()
+    assert len(report.notes) == 1
+    assert (
+        "was not checked: optimal_return is unknown, and rewards are paid before" in report.notes[0]
+    )
+
+
+def test_the_only_reward_of_an_unknown_best_return_is_a_solution() -> None:
+    lost = told(lambda s, t, a: {"outcome": -jnp.ones(1)})
+    unknown = type("Unknown", (lost,), {"optimal_return": Balance.optimal_return})
+    (fault,) = envs.check_world(record(unknown())).faults
+    assert "ends the episode with a reward, and its outcome is [-1.0]" in fault
+
+
 def test_chance_that_has_no_part_is_a_note() -> None:
     calm = changed(spec=replace(Track.spec, deterministic=False))
     report = envs.check_world(record(calm()))

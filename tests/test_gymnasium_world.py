@@ -46,6 +46,17 @@ def test_they_keep_what_every_world_promises(world) -> None:
     assert report.faults == ()
 
 
+def test_an_environment_that_pays_every_step_is_sound() -> None:
+    """CartPole pays 1 for each step and ends when the pole falls, which is not the goal."""
+    described = GymnasiumWorld(
+        name="cartpole", make=lambda: gymnasium.make("CartPole-v1", max_episode_steps=40),
+        return_range=(0.0, 40.0), achieved=lambda moment: moment.obs[2:3], desired=lambda moment: [0.0],
+    )  # fmt: skip
+    report = envs.check_world(described.world(num_test_tasks=4))
+    assert report.faults == ()
+    assert "rewards are paid before the end of an episode" in report.notes[0]
+
+
 def played_by_hand(seed: int, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Observations and rewards of the environment itself, stepped without any of this."""
     env = Plane()

@@ -94,6 +94,7 @@ def check_world(world: World | Environment | str, seed: int = 0) -> Report:
     if not impure:  # otherwise no other observation would be reliable
         for rule in rules.OF_EPISODES:
             faults += rule(case)
+        faults += rules.outcome_faults(case, notes)
         faults += rules.chance_faults(case, notes)
     return Report(name, tuple(faults), tuple(notes), facts)
 
