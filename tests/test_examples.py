@@ -38,6 +38,24 @@ def test_the_guide_shows_the_example() -> None:
     assert f"{len(source.splitlines())} lines" in GUIDE.read_text()
 
 
+def test_stuck_searches_are_counted(tmp_path: Path) -> None:
+    """Of two seeds and three tasks, two are solved; one of the others had an optimal episode of each kind,
+    and one a sampled one only."""
+    from examples.stuck import count_stuck
+
+    greedy = np.tile([True, False], (2, 3, 2))
+    returns = np.zeros((2, 3, 4))
+    returns[0, 1, 0] = returns[0, 1, 1] = returns[1, 2, 3] = 1.0
+    returns[0, 0, 0] = 1.0
+    judged = np.zeros((2, 3, 2))
+    judged[0, 0, 1] = judged[1, 0, 1] = 1.0
+    np.savez(
+        tmp_path / "results.npz",
+        **{"eval_returns": judged, "returns": returns, "choice.greedy": greedy},
+    )
+    assert count_stuck(tmp_path).tolist() == [4, 1, 2]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["doors", "point_maze"])
 def test_they_are_sound(name: str) -> None:
