@@ -29,7 +29,7 @@ from envs.kitchen.official import (  # noqa: E402
     num_in_turn,
 )
 from envs.official import Own, Played, play  # noqa: E402
-from experiments.store.results import load_results  # noqa: E402
+from experiments.store.result_files import load_results  # noqa: E402
 from mgpo_jax.acting import Actor  # noqa: E402
 from mgpo_jax.policy_files import load_policy  # noqa: E402
 
