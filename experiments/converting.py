@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from envs.errors import DataError, UsageError, printable, shown
+from experiments.dropped_ends import kind_of_end
 from experiments.sources import ACTIONS, TERMINATED, TRUNCATED, Source, first_of
 from experiments.store.data_settings import ImportConfig
 
@@ -127,6 +128,9 @@ class Converter:
         self.function = load_function(config.goal) if config.goal else None
         self.num_cut = 0
         """Number of episodes without an observation after their last action."""
+        self.dropped_end: tuple[str, int] | None = None
+        """How the latest episode ended (``dropped_ends.KINDS``) and the number of its actions, if its last
+        action was dropped and its logs mark ends; otherwise None."""
 
     def rows(self, who: str, arrays: Mapping[str, np.ndarray]) -> Rows:
         """The rows of one episode.
@@ -156,18 +160,26 @@ class Converter:
         if rewards is not None and not self._lacks("rewards"):
             rows["rewards"] = np.asarray(rewards, np.float32).reshape(-1)[:num]
         rows["last_obs"] = obs[-1:]
-        cut_off = len(actions) > num
-        ends = {} if self._lacks("ends") else {"terminated": TERMINATED, "truncated": TRUNCATED}
-        for name, names in ends.items():
-            flag = first_of(names, arrays)
-            # If the last step was dropped, so was the end of the episode.
-            ended = flag is not None and not cut_off and bool(np.reshape(flag, -1)[-1])
-            rows[name] = np.array([ended])
+        if not self._lacks("ends"):
+            rows |= self.ends(arrays, len(actions), num)
         for name in OWN_BY_TRAJECTORY:
             if name in arrays:
                 rows[name] = np.reshape(arrays[name], -1)[:1]
         check_rows(who, rows, num)
         return rows
+
+    def ends(self, arrays: Mapping[str, np.ndarray], num_actions: int, num: int) -> Rows:
+        """How an episode ended. If its last action was dropped, so was its end, which is kept in
+        ``dropped_end``."""
+        flags = [first_of(names, arrays) for names in (TERMINATED, TRUNCATED)]
+        marks = [flag is not None and bool(np.reshape(flag, -1)[-1]) for flag in flags]
+        is_marked, was_dropped = any(flag is not None for flag in flags), num_actions > num
+        self.dropped_end = (kind_of_end(*marks), num_actions) if is_marked and was_dropped else None
+        names = ("terminated", "truncated")
+        return {
+            name: np.array([mark and not was_dropped])
+            for name, mark in zip(names, marks, strict=True)
+        }
 
     def _lacks(self, what: str) -> bool:
         """Whether our own export notes that the original dataset had no such arrays."""

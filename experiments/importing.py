@@ -15,6 +15,7 @@ import numpy as np
 
 from envs.errors import DataError, printable
 from experiments.converting import BadEpisodeError, Converter, Rows, sized_of
+from experiments.dropped_ends import Tally
 from experiments.sources import Source, opened
 from experiments.store.data_settings import ImportConfig
 from experiments.store.provenance import versions
@@ -66,7 +67,7 @@ def import_dataset(config: ImportConfig) -> str:
     assert config.out is not None
     skipped: list[str] = []
     with opened(config.source) as source, new_folder(config.out) as place:
-        converter, writer = Converter(config, source), Writer(place)
+        converter, writer, ends = Converter(config, source), Writer(place), Tally()
         horizon = _horizon(config, source)
         with Progress(source.num, "episode") as progress:
             for who, arrays in source.episodes:
@@ -80,11 +81,13 @@ def import_dataset(config: ImportConfig) -> str:
                     skipped.append(str(error))
                     continue
                 writer.add(who, rows)
+                if converter.dropped_end is not None:
+                    ends.add(len(writer.lengths) - 1, *converter.dropped_end)
                 progress.update()
         if not writer.lengths:
             raise DataError(f"{config.source} has no episode that can be used")
         manifest = _manifest(config, source, writer, horizon, skipped)
-        writer.finish(manifest)
+        writer.finish({**manifest, **ends.entry()})
     lengths = np.array(writer.lengths)
     said = [
         f"{config.out}: {len(lengths)} trajectories of {lengths.min()} to {lengths.max()} steps, "

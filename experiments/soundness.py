@@ -19,8 +19,9 @@ import numpy as np
 import envs
 from envs.base import EnvSpec
 from envs.errors import printable
+from experiments import dropped_ends
 from mgpo_jax.dataset import STEP_ARRAYS, Dataset, load_dataset
-from mgpo_jax.manifest import Facts, read_facts
+from mgpo_jax.manifest import Facts, read_facts, read_manifest
 from mgpo_jax.mapped import let_go
 
 SAMPLE = 20_000  # maximum number of steps in a regression
@@ -74,6 +75,7 @@ def examine(folder: Path, env: str | None = None, horizon: int | None = None) ->
     _wrong_observations(dataset, found)
     _misaligned(dataset, facts, found)
     _wrong_ends(dataset, horizon or facts.spec.horizon, found)
+    _wrong_dropped_ends(folder, horizon or facts.spec.horizon, found)
     _duplicates(dataset, found)
     _idle_goals(dataset, found)
     return found
@@ -267,6 +269,13 @@ def _wrong_ends(dataset: Dataset, horizon: int, found: Findings) -> None:
         )
 
 
+def _wrong_dropped_ends(folder: Path, horizon: int, found: Findings) -> None:
+    """Find the same in ends that the import dropped with the last actions of episodes."""
+    ends = read_manifest(folder)[1].dropped_ends
+    for word, kind, text in dropped_ends.wrong_ends(ends, horizon) if ends else ():
+        (found.faults if word == "fault" else found.notes)[kind].append(text)
+
+
 def _duplicates(dataset: Dataset, found: Findings) -> None:
     """Find trajectories with the same observations and actions; on the same task this is only a note."""
     seen: dict[bytes, int] = {}
@@ -329,7 +338,7 @@ def described(folder: Path) -> str:
         ("goals", f"{facts.goal_dim} numbers, {_spread(dataset.achieved_goals)}"),
         ("  reached", f"at {float(np.mean(dataset.goal_reached)):.1%} of the steps"),
         ("returns", _returns(dataset)),
-        ("ends", _ends(dataset)),
+        ("ends", _ends(dataset) + dropped_ends.in_words(read_manifest(folder)[1].dropped_ends)),
         ("size", _size(folder, dataset)),
     ]
     if facts.spec.action_low:

@@ -62,6 +62,29 @@ class SpecEntry(BaseModel):
     """The original value of 1 in each component; empty if actions were not rescaled."""
 
 
+class EndCount(BaseModel):
+    """How many episodes of one length ended in one way."""
+
+    model_config = STRICT
+
+    steps: Size
+    """Number of actions of each of these episodes in the logs."""
+    episodes: Count
+    first: Index
+    """Index of the first trajectory among them."""
+
+
+class DroppedEnds(BaseModel):
+    """How episodes ended in logs of others, if their last actions were dropped by the import."""
+
+    model_config = STRICT
+
+    terminated: list[EndCount] = []
+    truncated: list[EndCount] = []
+    """Episodes that are marked as truncated, whether or not they are marked as terminated, too."""
+    neither: list[EndCount] = []
+
+
 class Manifest(BaseModel):
     """The known entries of ``manifest.json``; further ones are allowed."""
 
@@ -75,6 +98,7 @@ class Manifest(BaseModel):
     files: Annotated[dict[Name, Sha256], MaxLen(32)] = {}
     """The hash of each array's file, by the name of the array; only in mapped datasets."""
     spec: SpecEntry | None = None
+    dropped_ends: DroppedEnds | None = None
     env: Name | None = None
     policy: DemonstratorName | None = None
     settings: dict[str, Json] = {}

@@ -554,6 +554,70 @@ def test_time_limits_that_are_marked_as_ends(sound):
     )
 
 
+def only_before_actions(episodes):
+    """The same logs with as many observations as actions, so that the import drops the last actions."""
+    return flat(episodes, with_next=False)
+
+
+def early(episodes):
+    """Two of three episodes end their task after 13 to 23 steps, the others at a limit of 30."""
+    for index, episode in enumerate(episodes):
+        length = 30 if index % 3 == 0 else 12 + index
+        for name, array in episode.items():
+            episode[name] = array[: length + (name == "observations")]
+        last = np.arange(length) == length - 1
+        episode["terminals"], episode["timeouts"] = last & (index % 3 > 0), last & (index % 3 == 0)
+    return episodes
+
+
+def test_ends_that_were_dropped_are_still_checked():
+    episodes = early(walk())
+    np.savez("right.npz", **only_before_actions(episodes))
+    imported("right.npz", "right")
+    assert examine(Path("right")).num_faults == 0
+    assert (
+        "0 terminated, 0 truncated, 12 neither; in the logs 8 terminated, 4 truncated"
+        in described(Path("right"))
+    )
+    for episode in episodes:
+        episode["terminals"], episode["timeouts"] = episode["timeouts"], episode["terminals"]
+    np.savez("swapped.npz", **only_before_actions(episodes))
+    dataset, manifest, _ = imported("swapped.npz", "swapped")
+    assert not dataset.terminated.any()
+    assert {"steps": 30, "episodes": 4, "first": 0} in manifest["dropped_ends"]["terminated"]
+    found = examine(Path("swapped"))
+    assert found.faults == {
+        "time limits": [
+            "trajectory 0, step 29 of its logs: it is marked as terminated at the very horizon, as 4 of 4 "
+            "of this length are; a time limit is a truncation, or terminals and timeouts are swapped"
+        ]
+    }
+
+
+def test_dropped_ends_before_the_horizon_are_a_note():
+    episodes = early(walk())
+    for episode in episodes:
+        episode["timeouts"] = episode["timeouts"] | episode["terminals"]
+    np.savez("cut.npz", **only_before_actions(episodes))
+    imported("cut.npz", "cut")
+    found = examine(Path("cut"))
+    assert found.num_faults == 0
+    assert (
+        "it is marked as truncated before the horizon of 30, as 8 are"
+        in found.notes["cut early"][0]
+    )
+
+
+def test_logs_without_marks_of_ends_have_none_that_were_dropped():
+    episodes = walk()
+    for episode in episodes:
+        del episode["terminals"], episode["timeouts"]
+    arrays = only_before_actions(episodes)
+    arrays["lengths"] = np.array([len(episode["actions"]) for episode in episodes])
+    np.savez("plain.npz", **arrays)
+    assert "dropped_ends" not in imported("plain.npz", "plain")[1]
+
+
 def test_lengths_over_the_horizon(sound):
     found, all_of = faults(sound, horizon=27)
     assert found == {"too long": "trajectory 0, step 27: it has 30 steps, the horizon is 27"}
