@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from envs.errors import UsageError, shown
-from envs.live import Act, Moment, Pool, Reading, Start, num_cores
+from envs.live import Act, Moment, Pool, Reading, Start, num_cores, single_envs
 from envs.registry import World
 
 if TYPE_CHECKING:
@@ -50,7 +50,8 @@ class GymnasiumWorld:
 
     Attributes:
       name: the name of the world.
-      make: creates an environment, such as ``lambda: gymnasium.make("PointMaze_UMaze-v3")``.
+      make: creates an environment, such as ``lambda: gymnasium.make("PointMaze_UMaze-v3")``. It may also
+        return a ``gymnasium.vector.SyncVectorEnv``, whose environments are then used one by one.
       return_range: smallest and largest possible return.
       horizon: number of actions after which an episode is truncated [``max_episode_steps`` / ``repeat``].
       repeat: number of environment steps per action; their rewards are summed.
@@ -151,6 +152,7 @@ class GymnasiumWorld:
             scripts=self.scripts,
             most=self.most,
             num_threads=self.threads or num_cores(),
+            spare=single_envs(self._first_made)[1:],
         )
 
     @cached_property
@@ -193,6 +195,11 @@ class GymnasiumWorld:
     @cached_property
     def _example(self) -> Any:
         """An environment that is only inspected; no episode runs in it."""
+        return single_envs(self._first_made)[0]
+
+    @cached_property
+    def _first_made(self) -> Any:
+        """The first result of ``make``, which may hold several environments."""
         return self.make()
 
     def _horizon(self, env: Any) -> int:

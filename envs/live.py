@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import hashlib
 import os
+import sys
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from threading import Lock
@@ -20,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from envs.errors import DataError
+from envs.errors import DataError, UsageError
 
 
 class Moment(NamedTuple):
@@ -83,13 +84,14 @@ class Pool:
     """A pool of live environments of one kind. It is thread-safe.
 
     Attributes:
-      make: creates an environment.
+      make: creates an environment, or several in a ``SyncVectorEnv``.
       reset: ``(env, start) -> moment``.
       step: ``(env, action) -> moment``, with an action in the form of programs.
       read: ``(moment) -> reading``.
       scripts: ``(env, generator) -> act``, by name.
       most: number of environments that are kept alive; the least recently used one is evicted.
       num_threads: number of threads that step them.
+      spare: environments that were made before and may be used.
     """
 
     make: Callable[[], Any]
@@ -99,14 +101,18 @@ class Pool:
     scripts: Mapping[str, Callable[[Any, np.random.Generator], Act]] = field(default_factory=dict)
     most: int = 256
     num_threads: int = 1
+    spare: Sequence[Any] = ()
 
     def __post_init__(self) -> None:
         self._lock = Lock()
         self._live: OrderedDict[bytes, Live] = OrderedDict()
-        self._idle: list[Any] = []
+        self._idle: list[Any] = [*self.spare]
+        self._made: list[
+            Any
+        ] = []  # vector environments close their parts when they are no longer referenced
         self._memory: OrderedDict[bytes, tuple[bytes, Reading]] = OrderedDict()
         self._threads = ThreadPoolExecutor(self.num_threads) if self.num_threads > 1 else None
-        self.num_made = self.num_replayed = 0
+        self.num_made, self.num_replayed = len(self._idle), 0
 
     def begin(self, start: Start) -> tuple[bytes, Moment, Reading]:
         """Begin an episode; returns its identity, its first moment and the reading of that moment."""
@@ -244,7 +250,36 @@ class Pool:
             if self.num_made >= self.most and self._live:
                 return self._live.popitem(last=False)[1].env
             self.num_made += 1
-        return self.make()
+        made = self.make()
+        first, *others = single_envs(made)
+        with self._lock:
+            self._made.append(made)
+            self._idle += others
+            self.num_made += len(others)
+        return first
+
+
+def single_envs(made: Any) -> list[Any]:
+    """The single environments that were made: those of a ``SyncVectorEnv``, or the one that is given.
+
+    Single environments are reset and stepped one by one, each with a seed of its own and never beyond the
+    end of an episode, so that the automatic resets of a vector environment do not happen.
+
+    Raises:
+      UsageError: if it is another vector environment, whose parts cannot be reset one by one.
+    """
+    vector = sys.modules.get("gymnasium.vector")  # loaded if there is any vector environment
+    if vector is None or not isinstance(made, vector.VectorEnv):
+        return [made]
+    if isinstance(made, vector.SyncVectorEnv):
+        return list(made.envs)
+    identity = getattr(getattr(made, "spec", None), "id", "ID")
+    made.close()
+    raise UsageError(
+        f"make returns a {type(made).__name__}, whose environments cannot be reset one by one; return a "
+        f'single environment, such as gymnasium.make("{identity}"), or a gymnasium.vector.SyncVectorEnv '
+        "without wrappers around it"
+    )
 
 
 def num_cores() -> int:

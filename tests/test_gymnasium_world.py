@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
 import json
 import shutil
@@ -127,6 +128,62 @@ def test_few_live_environments_and_threads_change_nothing() -> None:
     assert (found[0].return_ == 1).all()
     assert described.pool.num_replayed > 0
     assert described.pool.num_made <= 5
+
+
+class Closable(Plane):
+    """A plane that tells whether it was closed, as its environment of many does when it is forgotten."""
+
+    is_closed = False
+
+    def close(self):
+        self.is_closed = True
+
+    def step(self, action):
+        assert not self.is_closed
+        return super().step(action)
+
+
+def many_planes(mode: str):
+    """Three planes in one vector environment, which resets them in one of gymnasium's ways."""
+    mode = gymnasium.vector.AutoresetMode[mode]
+    return gymnasium.vector.SyncVectorEnv([Closable] * 3, autoreset_mode=mode)
+
+
+@pytest.mark.parametrize("mode", ["NEXT_STEP", "SAME_STEP", "DISABLED"])
+def test_the_environments_of_a_vector_environment_are_used_one_by_one(mode: str) -> None:
+    """Episodes are those of single environments to the last bit, also beyond the end of some of them."""
+    found = []
+    for described in (fresh(PLANE), fresh(PLANE, make=partial(many_planes, mode))):
+        env, pool, rng = described.environment(), described.pool, np.random.default_rng(0)
+        starts = [Start(int(rng.integers(1000)), ()) for _ in range(5)]
+        moves = rng.uniform(-1, 1, (5, 12, 2)).astype(np.float32)
+        told = []
+        for start, actions in zip(starts, moves, strict=True):
+            identity, moment, reading = pool.begin(start)
+            assert type(moment.env) in (Plane, Closable)
+            gc.collect()
+            for step in range(12):
+                told.append((identity, *map(bytes, reading)))
+                if not reading.over:
+                    identity, reading = pool.advance(start, identity, actions[:step], actions[step])
+        # An episode without an end keeps its environment; one of each first three is only inspected.
+        assert pool.num_made <= 5 + 3
+        assert env.spec.obs.shape == (4,)
+        found.append(told)
+    assert found[0] == found[1]
+
+
+def test_vector_environments_of_another_kind_are_refused() -> None:
+    native = partial(gymnasium.make_vec, "CartPole-v1", vectorization_mode="vector_entry_point")
+    wrapped = partial(gymnasium.wrappers.vector.ClipReward, min_reward=0.0)
+    for make, name, single in (
+        (native, "CartPoleVectorEnv", "CartPole-v1"),
+        (lambda: wrapped(many_planes("NEXT_STEP")), "ClipReward", "ID"),
+    ):
+        with pytest.raises(UsageError, match=f"make returns a {name}, whose .*cannot be") as error:
+            fresh(PLANE, make=make).environment()
+        assert f'single environment, such as gymnasium.make("{single}")' in str(error.value)
+        assert "\n" not in str(error.value)
 
 
 def test_accelerators_call_the_host_in_another_way(monkeypatch: pytest.MonkeyPatch) -> None:
