@@ -1,9 +1,12 @@
-"""The worlds as gymnasium environments: ``gymnasium.make("mgpo_jax/maze15-v0")``.
+"""The worlds as gymnasium environments.
 
-They are registered when this module is imported, for which gymnasium has ``gymnasium.register_envs``:
+They are registered when this module is imported. Gymnasium does so if the name of the module precedes the
+name of the environment:
 
-    import gymnasium, envs.to_gymnasium
-    gymnasium.register_envs(envs.to_gymnasium)
+    gymnasium.make("envs.to_gymnasium:mgpo_jax/maze15-v0")
+
+After ``import envs.to_gymnasium``, the name ``mgpo_jax/maze15-v0`` is enough. Since version 1.0, gymnasium
+has no entry points by which an installed package could announce its environments.
 
 An observation is a dict of ``observation``, ``achieved_goal`` and ``desired_goal``, as in the ``GoalEnv``
 of gymnasium-robotics. The desired goal is the task goal, which does not reveal everything about the task.

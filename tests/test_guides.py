@@ -10,6 +10,7 @@ import contextlib
 import importlib
 import io
 import re
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -117,6 +118,22 @@ def test_a_world(of_world: str) -> None:
 def test_a_method(of_world: str) -> None:
     """On the policy of the guide to worlds, which is followed first."""
     assert column(follow("own-method.md"), "method") == ["ucb", "climb:METHOD"]
+
+
+def test_our_worlds_are_made_by_gymnasium_as_printed(tmp_path: Path) -> None:
+    """The block of the guide and the line of the README, in new processes where nothing is registered."""
+    guide = (GUIDES / "own-gymnasium-world.md").read_text()
+    section = guide[guide.index("## The other way round") :]
+    block = "\n".join(re.findall(r"^    (.*)$", section, flags=re.MULTILINE))
+    assert "gymnasium.make" in block
+    readme = (GUIDES.parents[1] / "README.md").read_text()
+    (line,) = re.findall(r"`(gymnasium\.make\([^`]*\))`", readme)
+    assert line in section.replace("\n", " ")
+    for code in (f"import gymnasium\n{line}.reset(seed=0)", f"{block}\nassert env.reset(seed=0)"):
+        done = subprocess.run(
+            [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr[-1000:]
 
 
 def test_links_lead_somewhere() -> None:
