@@ -26,6 +26,10 @@ PAGES = {
 MODULES = (
     "envs.base",
     "envs.registry",
+    "envs.gymnasium_world",
+    "envs.live",
+    "envs.to_gymnasium",
+    "envs.checks",
     "mgpo_jax.adaptation",
     "mgpo_jax.methods",
     "mgpo_jax.optimizers.base",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib.util
 import json
 import os
@@ -137,6 +138,24 @@ def test_the_reference_has_every_public_name() -> None:
         page = module if module in site.MODULES else site.PACKAGE
         shown = module if module in site.MODULES else place
         assert f"::: {shown}\n" in pages[f"api/{page}.md"]
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        "envs.gymnasium_world.GymnasiumWorld",
+        "envs.live.Moment",
+        "envs.to_gymnasium.WorldEnv",
+        "envs.checks.check_world",
+    ],
+)
+def test_the_reference_has_what_own_worlds_need(place: str) -> None:
+    module, _, name = place.rpartition(".")
+    assert f"::: {module}\n" in dict(hooks().reference())[f"api/{module}.md"]
+    source = ROOT.joinpath(*module.split("."))
+    path = source / "__init__.py" if source.is_dir() else source.with_suffix(".py")
+    defined = [node for node in ast.parse(path.read_text()).body if hasattr(node, "name")]
+    assert ast.get_docstring(next(node for node in defined if node.name == name))
 
 
 def test_the_site_builds_without_a_warning_and_loads_nothing_from_elsewhere(tmp_path: Path) -> None:
