@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +16,7 @@ import pytest
 import envs
 from envs.episodes import run_episode
 from envs.registry import World
+from mgpo_jax.dataset import load_dataset
 
 ROOT = Path(__file__).parents[1]
 GUIDE = ROOT / "docs" / "guides" / "own-gymnasium-world.md"
@@ -125,3 +127,30 @@ def test_a_place_far_from_the_start_is_told_from_near_ones() -> None:
     trajectory = SimpleNamespace(goal_reached=achieved.any(axis=-1), achieved_goals=achieved)
     found = places.arrivals(SimpleNamespace(trajectory=trajectory), goal)
     np.testing.assert_allclose(found, (1 / 3, 2 / 3))
+
+
+def test_the_large_data_are_a_dataset_and_the_guide_has_their_training(tmp_path: Path) -> None:
+    big_data = importlib.import_module("examples.big_data")
+    big_data.write(tmp_path / "data", 3)
+    dataset, _ = load_dataset(tmp_path / "data")
+    assert dataset.lengths.tolist() == [50, 50, 50]
+    assert dataset.obs.dtype == np.uint8
+    assert len(np.unique(dataset.obs[::50].reshape(3, -1), axis=0)) == 3
+    guide = " ".join((GUIDE.parent / "own-data.md").read_text().replace("\\\n", " ").split())
+    assert f"--data /tmp/big_data {big_data.TRAINING} --out /tmp/big_run" in guide
+
+
+@pytest.mark.slow
+def test_the_memory_of_a_training_hardly_grows_with_its_data(tmp_path: Path) -> None:
+    """Ten times the data, 300 MB instead of 30, take far less than those more bytes of memory."""
+    peaks = []
+    for num in (48, 480):
+        words = (
+            f"{tmp_path}/{num} --trajectories {num} --run {tmp_path}/run{num} --steps 10".split()
+        )
+        done = subprocess.run(
+            [sys.executable, "-m", "examples.big_data", *words],
+            cwd=ROOT, capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        peaks.append(float(done.stdout.split("trained: peak ")[1].split(" MB")[0].replace(",", "")))
+    assert peaks[1] - peaks[0] < 150, peaks
