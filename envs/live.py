@@ -276,9 +276,9 @@ def single_envs(made: Any) -> list[Any]:
     identity = getattr(getattr(made, "spec", None), "id", "ID")
     made.close()
     raise UsageError(
-        f"make returns a {type(made).__name__}, whose environments cannot be reset one by one; return a "
-        f'single environment, such as gymnasium.make("{identity}"), or a gymnasium.vector.SyncVectorEnv '
-        "without wrappers around it"
+        f"make returns {type(made).__name__}, a vector environment whose parts cannot be reset one by one; "
+        f'return a single environment, such as gymnasium.make("{identity}"), or a '
+        "gymnasium.vector.SyncVectorEnv without wrappers around it"
     )
 
 

@@ -180,7 +180,7 @@ def test_vector_environments_of_another_kind_are_refused() -> None:
         (native, "CartPoleVectorEnv", "CartPole-v1"),
         (lambda: wrapped(many_planes("NEXT_STEP")), "ClipReward", "ID"),
     ):
-        with pytest.raises(UsageError, match=f"make returns a {name}, whose .*cannot be") as error:
+        with pytest.raises(UsageError, match=f"make returns {name}, a vector .*cannot be") as error:
             fresh(PLANE, make=make).environment()
         assert f'single environment, such as gymnasium.make("{single}")' in str(error.value)
         assert "\n" not in str(error.value)
