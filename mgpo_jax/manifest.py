@@ -129,7 +129,7 @@ def read_manifest(folder: Path, mend: str = "") -> tuple[dict[str, Any], Manifes
     """
     path, mend = Path(folder) / MANIFEST, mend or mend_for(folder)
     if not path.is_file():
-        raise DataError(f"no dataset in {folder} ({MANIFEST} is missing); {mend}")
+        raise DataError(f"no dataset in {folder}{_what_is_there(Path(folder))}")
     document = read_document(path, dict[str, Json], mend)
     manifest: Manifest = checked_entry(document, Manifest, path, "", mend)
     if manifest.format not in FORMATS:
@@ -140,6 +140,22 @@ def read_manifest(folder: Path, mend: str = "") -> tuple[dict[str, Any], Manifes
     if manifest.format == MAPPED and hash_of_files(manifest.files) != manifest.sha256:
         raise DataError(f"{path}: sha256 is not that of its list of files; {mend}")
     return document, manifest
+
+
+def _what_is_there(folder: Path) -> str:
+    """What is in the place of a dataset, and what to do about it, as the end of a message.
+
+    What lies there may be logs that exist only once, so the message never says just to remove them.
+    """
+    missing = f" ({MANIFEST} is missing)"
+    how = f"import logs with `mgpo data import {folder} --out FOLDER`, and give that FOLDER"
+    if not folder.exists():
+        return ": there is no such folder; give the folder of a dataset, as `mgpo data import` makes it"
+    if not folder.is_dir():
+        return f": it is a file, and a dataset is a folder; {how}"
+    if (folder / ARRAYS).is_file():
+        return f"{missing}; if it is a damaged dataset, {mend_for(folder)}; if not, {how}"
+    return f"{missing}, so it was not imported; {how}"
 
 
 def hash_of_files(files: Mapping[str, str]) -> str:

@@ -338,6 +338,27 @@ def test_no_folder(tmp_path):
         load_dataset(tmp_path / "nowhere")
 
 
+NO_DATASET = {
+    "nowhere": "no dataset in .*: there is no such folder; give the folder of a dataset",
+    "logs.npz": "it is a file, and a dataset is a folder; import logs with `mgpo data import .*logs.npz ",
+    "episodes": "so it was not imported; import logs with `mgpo data import .*episodes --out FOLDER`",
+    "of arrays": "so it was not imported; import logs with",
+}
+
+
+@pytest.mark.parametrize("name", NO_DATASET)
+@pytest.mark.parametrize("read", [load_dataset, read_facts])
+def test_logs_that_were_not_imported_are_left_alone(tmp_path, name, read):
+    np.savez(tmp_path / "logs.npz", observations=np.zeros((3, 2)))
+    (tmp_path / "episodes").mkdir()
+    np.savez(tmp_path / "episodes" / "0.npz", observations=np.zeros((3, 2)))
+    (tmp_path / "of arrays").mkdir()
+    np.save(tmp_path / "of arrays" / "actions.npy", np.zeros(3))
+    with pytest.raises(DataError, match=NO_DATASET[name]) as error:
+        read(tmp_path / name)
+    assert "remove" not in str(error.value)
+
+
 ARRAY_DAMAGE = {
     "missing array": (
         lambda a: a.pop("achieved_goals"),

@@ -155,7 +155,9 @@ def test_a_run_that_was_killed_while_it_took_more_steps_can_go_on(here, monkeypa
 
 WRONG = {
     "--env none": "--env none is for data of your own",
-    "--data nowhere": "no dataset in nowhere",
+    "--data nowhere": "no dataset in nowhere: there is no such folder; give the folder of a dataset",
+    "--data first/policy/weights.npz": "it is a file, and a dataset is a folder; import logs with",
+    "--data first/policy": "(manifest.json is missing), so it was not imported; import logs with",
     "--data mine --demonstrator expert": "so --demonstrator does not apply to it",
     "--data mine --data-seed 1": "so --data-seed does not apply to it",
     "--data mine --method ptgm": "--method ptgm needs a world",
