@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from envs.errors import MissingExtraError, UsageError
+from envs.installing import how_to_install
 from envs.registry import World
 from mgpo_jax.files import to_json, written
 from mgpo_jax.network_configs import OBS_LIMIT, TransformerConfig
@@ -15,13 +16,12 @@ from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.policy_files import load_policy
 
 KEY = "mgpo_jax"  # key of our facts in the metadata of a model
-INSTALL = 'pip install -e ".[onnx]"'
 
 
 def check_extra() -> None:
     """Raise ``MissingExtraError`` if onnx is not installed, without importing it."""
     if importlib.util.find_spec("onnx") is None:
-        raise MissingExtraError(f"an export needs the package onnx: {INSTALL}")
+        raise MissingExtraError(f"an export needs the package onnx: {how_to_install('onnx')}")
 
 
 def check_exportable(config: TransformerConfig, name: str) -> None:

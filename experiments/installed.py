@@ -9,11 +9,11 @@ from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
+from envs.installing import DISTRIBUTION, how_to_install
 from envs.registry import World
 from mgpo_jax.kinds import KINDS
 from mgpo_jax.released import released_folder
 
-DISTRIBUTION = "mgpo-jax"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 OF_EXTRA = re.compile(r"extra\s*==\s*['\"]([^'\"]+)['\"]")
 INDIRECT = ("all", "dev", "docs", "notebook")  # extras for developers, or made of other extras
@@ -31,11 +31,6 @@ class Extra(NamedTuple):
         if not self.missing:
             return f"{self.name}: installed"
         return f"{self.name}: {', '.join(self.missing)} missing; {how_to_install(self.name)}"
-
-
-def how_to_install(extra: str) -> str:
-    """The command that installs an extra."""
-    return f"pip install '{DISTRIBUTION}[{extra}]'"
 
 
 def extras() -> list[Extra]:

@@ -175,5 +175,5 @@ def test_a_missing_package_is_named_with_what_installs_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(MissingExtraError, match=r'onnx: pip install -e "\.\[onnx\]"'):
+    with pytest.raises(MissingExtraError, match=r"onnx: pip install '.*\[onnx\]'$"):
         main(ExportConfig(out=tmp_path / "policy.onnx"))

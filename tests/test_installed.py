@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import json
+from importlib import metadata
 from pathlib import Path
 
 import pytest
 
 import envs
+from envs.errors import UsageError
+from envs.installing import how_to_install, how_to_reinstall
 from experiments import info, installed
 from experiments import list as listing
 from experiments.info import InfoConfig
 from experiments.installed import Extra, released_networks, size_of
 from experiments.list import ListConfig
+from experiments.store.extras import import_extra
+
+ROOT = Path(__file__).parents[1]
 
 
 def test_extras_are_those_of_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -28,6 +34,35 @@ def test_extras_are_those_of_the_package(monkeypatch: pytest.MonkeyPatch) -> Non
     assert installed.extras() == [fast, Extra("plain", ("jax",), ())]
     assert str(fast) == "fast: no-such-package missing; pip install 'mgpo-jax[fast]'"
     assert str(installed.extras()[1]) == "plain: installed"
+
+
+def test_what_is_missing_is_installed_without_a_clone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metadata, "version", lambda name: "0.1.0")
+    assert how_to_install("onnx") == "pip install 'mgpo-jax[onnx]'"
+    assert how_to_install() == "pip install 'mgpo-jax'"
+    assert how_to_reinstall("craftax").endswith(" 'craftax==0.1.0'")
+    with pytest.raises(
+        UsageError, match=r"^none\.such is not .*run `pip install 'mgpo-jax\[tb\]'`$"
+    ):
+        import_extra("none.such", "tb")
+
+
+def test_a_clone_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def version(name: str) -> str:
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "version", version)
+    assert how_to_install("onnx") == f"pip install '{ROOT}[onnx]'"
+    assert how_to_reinstall("craftax").endswith(" 'craftax'")
+
+
+def test_no_message_needs_a_clone() -> None:
+    """``pip install -e .`` only works in a clone, and most users have a wheel."""
+    sources = [
+        path for name in ("envs", "mgpo_jax", "experiments") for path in (ROOT / name).rglob("*.py")
+    ]
+    assert len(sources) > 200
+    assert [path.name for path in sources if "install -e" in path.read_text()] == []
 
 
 def test_networks_and_sizes(tmp_path: Path) -> None:

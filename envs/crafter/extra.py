@@ -12,8 +12,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from envs.errors import MissingExtraError
+from envs.installing import how_to_install, how_to_reinstall
 
-INSTALL = 'pip install -e ".[crafter]"'
 OLDEST = (1, 6, 1)
 TEXTURES = Path("craftax_classic/assets")
 
@@ -21,15 +21,15 @@ TEXTURES = Path("craftax_classic/assets")
 @cache
 def check_extra() -> None:
     """Raise ``MissingExtraError`` unless Craftax can be loaded, without importing it."""
-    oldest = ".".join(map(str, OLDEST))
+    oldest, install = ".".join(map(str, OLDEST)), how_to_install("crafter")
     try:
         found = version("craftax")
     except PackageNotFoundError:
-        raise MissingExtraError(f"Crafter needs craftax {oldest} or newer: {INSTALL}") from None
+        raise MissingExtraError(f"Crafter needs craftax {oldest} or newer: {install}") from None
     numbers = tuple(int(part) for part in found.split(".")[:3] if part.isdigit())
     if numbers < OLDEST:
         raise MissingExtraError(
-            f"Crafter needs craftax {oldest} or newer, found {found}: {INSTALL}"
+            f"Crafter needs craftax {oldest} or newer, found {found}: {install}"
         )
     texture_folder()
 
@@ -44,4 +44,6 @@ def texture_folder() -> Path:
     for folder in (spec.submodule_search_locations or ()) if spec else ():
         if (path := Path(folder) / TEXTURES / "grass.png").is_file():
             return path.parent
-    raise MissingExtraError(f"craftax has no textures ({TEXTURES}); reinstall it with {INSTALL}")
+    raise MissingExtraError(
+        f"craftax has no textures ({TEXTURES}); reinstall it with {how_to_reinstall('craftax')}"
+    )

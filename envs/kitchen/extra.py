@@ -14,8 +14,8 @@ from pathlib import Path
 from types import ModuleType
 
 from envs.errors import MissingExtraError
+from envs.installing import how_to_install, how_to_reinstall
 
-INSTALL = "pip install -e ."
 SCENE = Path("envs/assets/kitchen_franka/kitchen_assets/kitchen_env_model.xml")
 
 
@@ -39,11 +39,12 @@ def check_extra() -> None:
     if mujoco != mjx:
         raise MissingExtraError(
             f"mujoco {mujoco} and mujoco-mjx {mjx} do not match: the kitchen needs one version of "
-            f"both; {INSTALL} installs a pair that works"
+            f"both; {how_to_install()} installs a pair that works"
         )
     if not any((folder / "batch.py").is_file() for folder in _folders("mujoco")):
         raise MissingExtraError(
-            f"mujoco {mujoco} is too old to step many worlds at once; {INSTALL} installs one that can"
+            f"mujoco {mujoco} is too old to step many worlds at once; {how_to_install()} installs one that "
+            "can"
         )
     scene_path()
 
@@ -72,7 +73,8 @@ def scene_path() -> Path:
         if (path := folder / SCENE).is_file():
             return path
     raise MissingExtraError(
-        f"gymnasium-robotics has no kitchen scene ({SCENE}); reinstall it with {INSTALL}"
+        f"gymnasium-robotics has no kitchen scene ({SCENE}); reinstall it with "
+        f"{how_to_reinstall('gymnasium-robotics')}"
     )
 
 
@@ -80,7 +82,7 @@ def _installed_version(package: str) -> str:
     try:
         return version(package)
     except PackageNotFoundError:
-        raise MissingExtraError(f"the kitchen needs {package}: {INSTALL}") from None
+        raise MissingExtraError(f"the kitchen needs {package}: {how_to_install()}") from None
 
 
 def _folders(module: str) -> list[Path]:

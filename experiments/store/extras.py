@@ -6,6 +6,7 @@ import importlib
 from typing import Any
 
 from envs.errors import UsageError
+from envs.installing import how_to_install
 
 
 def import_extra(module: str, extra: str) -> Any:
@@ -17,4 +18,4 @@ def import_extra(module: str, extra: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError:
-        raise UsageError(f'{module} is not installed; run `pip install -e ".[{extra}]"`') from None
+        raise UsageError(f"{module} is not installed; run `{how_to_install(extra)}`") from None
