@@ -22,6 +22,9 @@ GROUPS = frozenset({"data", "train", "hyper"})
 """Nested settings in ``config.json``; each of their members has a flag."""
 IMPORTED = frozenset({"env", "method", "goal"})
 """Settings that can name a module to import, as ``module:attribute``."""
+OF_POLICIES = frozenset({"network", "sha256"})
+"""Entries of the ``config.json`` of every policy, which no run has."""
+CONFIG, MEND = "config.json", "give the config.json of a run"
 CHOOSER = {"hyper": "method"}
 """Groups to skip if a setting is typed: a method's hyper-parameters if the user names a method."""
 
@@ -43,12 +46,32 @@ def expanded(words: Sequence[str], config_class: type) -> list[str]:
         return list(words)
     names = _names(config_class)
     given = {names.get(name, name) for name in map(_name_of, typed) if name}
-    values = read_document(path, dict[str, Json], "give the config.json of a run")
+    values = _read(path)
     added = []
     for name, value in _settings(values, given):
         _check_setting(name, value, names.get(name, name))
         added += _words(name, value)
     return [*typed, *added, *words[len(typed) :]]
+
+
+def _read(path: Path) -> dict[str, Json]:
+    """The entries of the file that ``--config`` names.
+
+    Raises:
+      UsageError: if it is a folder, or the config of a policy.
+      DataError: if it is missing, damaged or no JSON object.
+    """
+    if path.is_dir():
+        inside = path / CONFIG
+        mend = f"give {inside}" if inside.is_file() else MEND
+        raise UsageError(f"--config {path} must be a file, found a folder; {mend}")
+    values: dict[str, Json] = read_document(path, dict[str, Json], MEND)
+    if values.keys() >= OF_POLICIES:
+        raise UsageError(
+            f"--config {path} must hold the settings of a run, found those of a policy; {MEND}, which is "
+            "usually one folder above its policy"
+        )
+    return values
 
 
 def _file_in(words: Sequence[str]) -> Path | None:

@@ -76,6 +76,21 @@ def test_damaged_files_are_named(
         parse(AdaptConfig, ["--config", str(tmp_path / "config.json")], adapt_default)
 
 
+def test_a_folder_and_a_policy_are_called_so(tmp_path: Path) -> None:
+    policy = ROOT / "mgpo_jax/pretrained/maze15/config.json"
+    for place, says in (
+        (UCB, rf"must be a file, found a folder; give {UCB}/config.json$"),
+        (tmp_path, "must be a file, found a folder; give the config.json of a run$"),
+        (
+            policy,
+            "must hold the settings of a run, found those of a policy; give the config.json of a run",
+        ),
+        (tmp_path / "no.json", "no.json is missing; give the config.json of a run"),
+    ):
+        with pytest.raises((UsageError, DataError), match=says):
+            parse(AdaptConfig, ["--config", str(place)], adapt_default)
+
+
 def test_a_file_never_decides_what_is_imported(tmp_path: Path) -> None:
     path = tmp_path / "config.json"
     path.write_text('{"env": "evil:WORLD"}')
