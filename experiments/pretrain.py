@@ -9,6 +9,7 @@ from typing import NoReturn
 from experiments.joining import check_flags, join
 from experiments.runtime import run, say
 from experiments.store.presets import check_pretraining, pretrain_default
+from experiments.store.recipes import schedule, told
 from experiments.store.runs import check_start
 from experiments.store.settings import PretrainConfig
 from mgpo_jax.manifest import read_facts
@@ -21,10 +22,11 @@ def main(config: PretrainConfig) -> None:
     if not config.dry_run:
         check_start(config)
         join(config)
-    if config.data.data_folder is not None:
-        from experiments.store.recipes import told
-
-        print(told(config, read_facts(config.data.data_folder)), file=sys.stderr)
+    folder = config.data.data_folder
+    if folder is not None:
+        print(told(config, read_facts(folder)), file=sys.stderr)
+    elif config.dry_run:  # a training prints its schedule when it begins
+        print(schedule(config), file=sys.stderr)
     if config.dry_run:
         from experiments.forecasts import of_training
 

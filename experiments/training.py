@@ -24,6 +24,7 @@ from experiments.signals import Stopped, asked_to_stop, farewell
 from experiments.store import runs
 from experiments.store.metrics import METRICS, Metrics, check_loggers, salvaged_rows
 from experiments.store.provenance import provenance
+from experiments.store.recipes import schedule
 from experiments.store.settings import NO_WORLD, PretrainConfig
 from experiments.training_data import own_dataset, prepare_dataset
 from experiments.watching import watched
@@ -202,6 +203,8 @@ def _has_ended(config: PretrainConfig) -> bool:
 def _train_and_save(run: Run, go_on: str) -> None:
     """Take the steps of a training, and write checkpoints, metrics, the policy and its curve."""
     config, folder = run.config, run.folder
+    if config.data.data_folder is None:  # otherwise it was printed with the recipe
+        print(schedule(config), file=sys.stderr)
     with checkpoints(folder / runs.CHECKPOINTS) as manager:
         blank = run.initial_state()
         before = restore_state(manager, blank, run.identities) if config.resume else None

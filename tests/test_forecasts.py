@@ -40,12 +40,26 @@ def test_what_was_never_measured_is_not_known(
     assert not list(tmp_path.iterdir())
 
 
+def test_a_training_that_goes_on_from_a_policy_tells_its_schedule(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    policy = str(ROOT / "mgpo_jax/pretrained/maze15")
+    words = ["--init", policy, "--steps", "1000", "--learning-rate", "1e-3", "--dry-run"]
+    pretrain.main(parse(PretrainConfig, words, pretrain_default))
+    (said,) = [line for line in capsys.readouterr().err.splitlines() if "schedule" in line]
+    assert said.startswith("schedule: 1,000 gradient steps of ")
+    assert "the learning rate rises to 0.001 within " in said
+
+
 def test_a_training_is_only_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     pretrain.main(parse(PretrainConfig, ["--steps", "4000", "--dry-run"], pretrain_default))
-    found = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()[2:])
+    out, err = capsys.readouterr()
+    assert "schedule: 4,000 gradient steps of 64 trajectories, which is 2.6 epochs" in err
+    found = dict(line.split(maxsplit=1) for line in out.splitlines()[2:])
     assert found["trajectories"] == "100,000, 200 of them held out"
     assert found["network"] == "606,853 weights"  # as the released policy has
     assert found["tokens"] == f"at most {5 + 2 * 64 - 1:,} a trajectory"

@@ -268,6 +268,15 @@ def test_policies_that_cannot_be_started_from_are_refused(command: Run, what: st
     assert not Path("data").exists()
 
 
+def test_a_training_tells_its_schedule(command: Run) -> None:
+    code, text = command(ON.replace("--out on", "--out new"))
+    assert code == 0
+    assert (
+        "schedule: 6 gradient steps of 8 trajectories, which is 1.5 epochs; the learning rate"
+        in text
+    )
+
+
 def test_a_run_is_no_policy(command: Run) -> None:
     code, text = command(f"{BASE} --init first --out new")
     assert (code, "with --init, such as RUN/policy" in text) == (1, True), text
