@@ -40,7 +40,7 @@ OUTSIDE = re.compile(r"[a-z][a-z0-9+.-]*:", re.IGNORECASE)  # http:, mailto:, da
 
 SECTIONS: tuple[tuple[str, Sequence[str]], ...] = (
     ("Home", ["index.md"]),
-    ("Guides", ["tour.md", "training.md", "guides/*", "export.md", "pages.md"]),
+    ("Guides", ["install.md", "tour.md", "training.md", "guides/*", "export.md", "pages.md"]),
     ("Results", ["results.md", "ablations.md", "baselines.md", "differences.md"]),
     ("How it works", ["architecture.md", "plan.md", "environments.md"]),
     ("API reference", ["api/mgpo_jax.md", *(f"api/{name}.md" for name in MODULES)]),

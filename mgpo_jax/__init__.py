@@ -8,6 +8,10 @@ jax; every name is loaded when it is first used.
 from __future__ import annotations
 
 import importlib
+import importlib.util
+import os
+from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -85,9 +89,31 @@ __all__ = [  # noqa: PLE0604
 ]
 
 
+@cache
+def _check_neighbor() -> None:
+    """Check that ``envs`` is the package beside this one and not a folder of the user's with that name.
+
+    Python searches the current folder first, so such a folder is found even if it has nothing to do with
+    this package.
+
+    Raises:
+      ImportError: if it is another one.
+    """
+    spec = importlib.util.find_spec("envs")
+    places = list(spec.submodule_search_locations or [spec.origin or ""]) if spec else []
+    wanted = Path(__file__).parent.parent / "envs"
+    if not any(os.path.realpath(place) == os.path.realpath(wanted) for place in places):
+        found = os.path.abspath(places[0]) if places else "nothing"
+        raise ImportError(
+            f"mgpo_jax needs its own package envs in {wanted}, but Python finds {found} under that name; "
+            "rename that one, or start Python in another folder"
+        )
+
+
 def __getattr__(name: str) -> Any:
     if name not in _PLACE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    _check_neighbor()
     module, attribute = _PLACE_OF[name]
     return getattr(importlib.import_module(module), attribute)
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import ast
 import inspect
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +21,8 @@ from mgpo_jax.dataset import BatchPlan
 from mgpo_jax.policy_files import read_policy
 from mgpo_jax.sharding import device_mesh
 from mgpo_jax.training import Trainer
+
+ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.parametrize("name", mgpo_jax.__all__)
@@ -144,3 +149,25 @@ def test_pretraining_says_what_does_not_fit(dataset):
         pretrain(dataset, SPEC, CONFIG, encoder="pixels")
     with pytest.raises(UsageError, match="unknown head for toy"):
         pretrain(dataset, SPEC, CONFIG, head="gaussian")
+
+
+@pytest.mark.parametrize("own", ["envs/__init__.py", "envs.py"])
+def test_packages_of_the_name_of_ours_are_named(tmp_path: Path, own: str) -> None:
+    """The current folder is searched first, so that a user's ``envs`` hides the one of this project."""
+    (tmp_path / own).parent.mkdir(exist_ok=True)
+    (tmp_path / own).write_text("raise RuntimeError('a stranger')")
+    code = "import mgpo_jax; mgpo_jax.make('maze15')"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    place = tmp_path / own.removesuffix("/__init__.py")
+    assert done.stderr.strip().splitlines()[-1] == (
+        f"ImportError: mgpo_jax needs its own package envs in {ROOT / 'envs'}, but Python finds {place} "
+        "under that name; rename that one, or start Python in another folder"
+    )
