@@ -7,6 +7,7 @@ import sys
 from importlib.metadata import version
 
 from envs.errors import nearest
+from experiments.runtime import PRINT_COMPLETION
 
 COMMANDS = {
     "list": "list the worlds, methods and networks, and what each needs",
@@ -40,7 +41,7 @@ def main() -> None:
     if words[0] == "--version":
         print(f"mgpo {version('mgpo-jax')}")
         sys.exit(0)
-    if words[0] == "--tyro-print-completion":  # as programs made with tyro have it
+    if words[0] == PRINT_COMPLETION:
         words[0] = "completion"
     if words[0] not in COMMANDS:
         print(f"error: {nearest(words[0], COMMANDS, 'command')}", file=sys.stderr)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import sys
 from collections.abc import Sequence
@@ -36,6 +37,8 @@ class CheckConfig(Common):
     """Folder of the policy that the results were made with, if it has been moved."""
     out: Path | None = None
     """JSON file to write the findings to."""
+    json: bool = False
+    """Print the findings as JSON."""
 
 
 def main(config: CheckConfig) -> None:
@@ -49,7 +52,7 @@ def main(config: CheckConfig) -> None:
     if config.out:
         refuse_existing_file(config.out, "--out")
     if worlds := named_worlds(config):
-        check(worlds, config.out)
+        check(worlds, config.out, config.json)
     else:
         compare_runs(config)
 
@@ -77,8 +80,8 @@ def is_world(text: str) -> bool:
     return text in envs.names() or (":" in text and "/" not in text)
 
 
-def check(names: Sequence[str], out: Path | None) -> None:
-    """Check worlds one after the other, and print a report of each.
+def check(names: Sequence[str], out: Path | None, as_json: bool = False) -> None:
+    """Check worlds one after the other, and print a report of each, or all of them as JSON.
 
     Raises:
       DataError: if any of them has a fault, after all reports.
@@ -89,9 +92,12 @@ def check(names: Sequence[str], out: Path | None) -> None:
     reports = {}
     for name in names:
         reports[name] = envs.check_world(name)
-        say(str(reports[name]))
+        if not as_json:
+            say(str(reports[name]))
+    found = {name: dataclasses.asdict(report) for name, report in reports.items()}
+    if as_json:
+        say(json.dumps({"worlds": found}, indent=2))
     if out:
-        found = {name: dataclasses.asdict(report) for name, report in reports.items()}
         write_json(out, {"worlds": found, **provenance()})
     broken = [name for name, report in reports.items() if report.faults]
     if broken:
@@ -106,17 +112,18 @@ def compare_runs(config: CheckConfig) -> None:
     from experiments.evaluation import open_case
     from experiments.store.provenance import provenance
     from experiments.store.tables import table
-    from mgpo_jax.files import write_json
+    from mgpo_jax.files import to_json, write_json
 
     cases = [open_case(folder, config.env, (), config.policy) for folder in config.runs]
     officials = officials_of(cases)
     rows: list[dict[str, Any]] = []
 
     def report() -> None:
-        say(table(HEAD, [cells(row) for row in rows]))
         found = summaries(cases, rows)
-        for summary in found:
-            say(told(summary))
+        if config.json:
+            say(json.dumps(to_json({"summaries": found, "rows": rows}), indent=2))
+        else:
+            say("\n".join([table(HEAD, [cells(row) for row in rows]), *map(told, found)]))
         if config.out:
             write_json(config.out, {"summaries": found, "rows": rows, **provenance()})
 

@@ -6,6 +6,7 @@ dataset, and ``info`` describes it.
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
@@ -65,8 +66,12 @@ def check_data(config: CheckDataConfig) -> None:
     from experiments.soundness import examine
 
     found = examine(folder, config.env, config.horizon)
-    for line in found.lines(config.most):
-        say(line)
+    if config.json:
+        from experiments.describing import findings
+
+        say(json.dumps(findings(found, config.most), indent=2))
+    else:
+        say("\n".join(found.lines(config.most)))
     if found.faults:
         raise DataError(
             f"{folder} has {found.num_faults} fault(s) of {len(found.faults)} kind(s); fix the logs, or "
@@ -77,6 +82,11 @@ def check_data(config: CheckDataConfig) -> None:
 def show_info(config: InfoConfig) -> None:
     """Describe a dataset: counts, lengths, shapes, spreads, sizes, and origin."""
     folder = require_folder(config.folder, "info")
+    if config.json:
+        from experiments.describing import facts_of
+
+        say(json.dumps(facts_of(folder), indent=2))
+        return
     from experiments.soundness import described
 
     say(described(folder))

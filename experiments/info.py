@@ -12,9 +12,12 @@ from typing import Any, NoReturn
 
 from experiments.installed import extras, size_of
 from experiments.runtime import Common, cache_folder, run, say
-from experiments.store.provenance import provenance
+from experiments.store.provenance import provenance, versions_of
 from experiments.store.settings import data_root
 from experiments.store.tables import block
+
+FURTHER = ("orbax-checkpoint", "gymnasium", "minari")
+"""Packages on which no result depends, but checkpoints, worlds and logs of others do."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +33,10 @@ def gathered() -> dict[str, Any]:
     import jax
 
     made = provenance()
+    versions = made["versions"] | versions_of(FURTHER)
     folders = {"compiled programs": Path(cache_folder()), "datasets": data_root()}
     return {
-        "versions": made["versions"],
+        "versions": versions,
         "revision": made["revision"],
         "system": platform.platform(),
         "backend": jax.default_backend(),

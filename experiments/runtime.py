@@ -35,6 +35,8 @@ from mgpo_jax import processes
 from mgpo_jax.claims import NO_ROOM, check_place
 from mgpo_jax.settings import flag
 
+PRINT_COMPLETION = "--tyro-print-completion"
+"""The flag of programs made with tyro; here it is the command ``completion``."""
 OF_CALLBACK = "INTERNAL: Error when calling buffer callback"
 """How jax's message begins when a host callback of a compiled program raises an error."""
 
@@ -136,6 +138,10 @@ def run(
       subcommand: the word before them that chose this command, for messages.
     """
     words = list(sys.argv[1:] if argv is None else argv)
+    if words[:1] == [PRINT_COMPLETION]:
+        from experiments.completion import command
+
+        command(words[1:])
     debug = "--debug" in words
     _make_sturdy(debug)
     config = None

@@ -12,7 +12,8 @@ import pytest
 from made_results import ENV, SIDE, TINY, made_results
 from test_results import policy_in, with_summary
 
-from envs.errors import UsageError
+from envs.checks import Report
+from envs.errors import DataError, UsageError
 from envs.maze.env import NORTH, MazeRunner
 from envs.official import Official, Own, play
 from envs.registry import WORLDS
@@ -104,6 +105,22 @@ def test_a_world_agrees_with_itself(result: Path, capsys: pytest.CaptureFixture[
     assert "4 of 4 prompts reach the same goals in the same order, 4 have the same return" in text
     assert text.count("the same |") == 4
     assert "to [1, 5]" in text
+
+
+def test_findings_as_json(
+    result: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any
+) -> None:
+    written, _ = checked(result, capsys)
+    check(CheckConfig(runs=(result,), json=True))
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == {name: written[name] for name in ("summaries", "rows")}
+
+    reports = iter([Report("maze15", ("it is broken",), facts={"steps": 3.0})])
+    monkeypatch.setattr("envs.check_world", lambda name: next(reports), raising=False)
+    with pytest.raises(DataError, match="faults found in maze15"):
+        check(CheckConfig(runs=(Path("maze15"),), json=True))
+    (report,) = json.loads(capsys.readouterr().out)["worlds"].values()
+    assert (report["faults"], report["facts"]) == (["it is broken"], {"steps": 3.0})
 
 
 def test_a_difference_is_shown(result: Path, register: Any, capsys: Any) -> None:

@@ -70,6 +70,7 @@ def test_every_shell_has_a_script_with_all_commands(shell: str) -> None:
         (["completion"], 'eval "$(mgpo completion bash)"'),
         (["completion", "bsh"], "unknown shell 'bsh'; did you mean 'bash'?"),
         (["--tyro-print-completion", "bsh"], "unknown shell 'bsh'; did you mean 'bash'?"),
+        (["adapt", "--tyro-print-completion", "bsh"], "unknown shell 'bsh'; did you mean 'bash'?"),
     ],
 )
 def test_what_is_no_shell_is_refused(
@@ -83,3 +84,14 @@ def test_what_is_no_shell_is_refused(
         importlib.import_module("experiments.__main__").main()
     assert stop.value.code == 2
     assert says in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["adapt"], ["data", "import"], []])
+def test_every_command_has_tyros_flag(
+    words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("experiments.completion.script", lambda shell: f"the script for {shell}")
+    monkeypatch.setattr("sys.argv", ["mgpo", *words, "--tyro-print-completion", "zsh"])
+    with pytest.raises(SystemExit) as stop:
+        importlib.import_module("experiments.__main__").main()
+    assert (stop.value.code, capsys.readouterr().out) == (0, "the script for zsh\n")

@@ -678,6 +678,13 @@ def test_the_command_from_logs_to_logs(capsys):
     code, out, _ = call(capsys, "check mine")
     assert (code, out) == (0, "no faults\n")
     assert call(capsys, "info mine")[0] == 0
+    found = json.loads(call(capsys, "info mine --json")[1])
+    assert (found["trajectories"], found["goals"]["size"]) == (12, 2)
+    assert found["lengths"]["max"] <= found["horizon"]
+    assert json.loads(call(capsys, "check mine --json")[1]) == {"faults": {}, "notes": {}}
+    code, out, _ = call(capsys, "check mine --horizon 20 --most 2 --json")
+    ((kind, faults),) = json.loads(out)["faults"].items()
+    assert (code, faults["count"], len(faults["shown"])) == (1, 12, 2), kind
     assert call(capsys, "export mine --out again.npz")[0] == 0
     before = {path: hash_file(path) for path in Path().rglob("*") if path.is_file()}
     for line, code, says in (

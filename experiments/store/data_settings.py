@@ -87,6 +87,8 @@ class CheckDataConfig(Common):
     """Steps after which an episode is truncated (default: the world's, or the manifest's)."""
     most: Count = 5
     """Maximum number of findings of each kind to print; the rest are only counted."""
+    json: bool = False
+    """Print the findings as JSON."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,6 +97,8 @@ class InfoConfig(Common):
 
     folder: tyro.conf.Positional[Path | None] = None
     """Folder of a dataset."""
+    json: bool = False
+    """Print the description as JSON."""
 
 
 SUBCOMMANDS: dict[str, Any] = {
