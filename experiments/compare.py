@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,9 +26,11 @@ class CompareConfig(Common):
     env: Name | None = None
     """Your own world, as module:attribute, if the results are from one."""
     csv: Path | None = None
-    """CSV file to write the final return of each task and run to."""
+    """CSV file to write the final return of each task to: the mean of each run, and each of its seeds."""
     profile: Path | None = None
     """PNG file to draw performance profiles to: the share of tasks and seeds that reach each score."""
+    json: bool = False
+    """Print the comparison as JSON."""
 
 
 def main(config: CompareConfig) -> None:
@@ -47,11 +50,14 @@ def main(config: CompareConfig) -> None:
         refuse_existing_file(config.profile, "--profile")
     if config.env is not None:
         envs.find(config.env)  # imports the module, so that the results may name it
-    from experiments.pairing import as_csv, as_table, differing
+    from experiments.pairing import as_csv, as_table, as_values, differing
     from experiments.store.result_files import load_results
 
     results = [load_results(folder, parts=()) for folder in config.runs]
-    text = as_table(config.runs, results)
+    if config.json:
+        text = json.dumps(as_values(config.runs, results), indent=2)
+    else:
+        text = as_table(config.runs, results)
     for warning in differing(config.runs, results):
         print(f"warning: {warning}", file=sys.stderr)
     say(text)

@@ -6,6 +6,7 @@ import csv
 import io
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -43,16 +44,41 @@ def as_table(runs: Sequence[Path], results: Sequence[Results]) -> str:
         row = [str(folder), result.method, str(final)]
         if result is not first:
             difference, improvement = compare(result, first)
-            row += [str(difference), str(improvement), _counts(result, first)]
+            row += [str(difference), str(improvement), " / ".join(map(str, _counts(result, first)))]
         rows.append(row + [""] * (len(HEAD) - len(row)))
     return table(HEAD, rows)
 
 
-def _counts(result: Results, first: Results) -> str:
+def as_values(runs: Sequence[Path], results: Sequence[Results]) -> dict[str, Any]:
+    """What ``as_table`` shows, and the warnings, as JSON values; an interval that is unknown is null.
+
+    Raises:
+      UsageError: for runs on different tasks.
+    """
+    first, found = results[0], []
+    for folder, result in zip(runs, results, strict=True):
+        values: dict[str, Any] = {
+            "run": str(folder),
+            "method": result.method,
+            "final_return": result.summary["final_return"],
+            "final_return_std_over_seeds": result.summary["final_return_std_over_seeds"],
+        }
+        if result is not first:
+            values |= {
+                name: part._asdict() for name, part in compare(result, first)._asdict().items()
+            }
+            values["tasks"] = dict(
+                zip(("better", "equal", "worse"), _counts(result, first), strict=True)
+            )
+        found.append(values)
+    return {"runs": found, "warnings": list(differing(runs, results))}
+
+
+def _counts(result: Results, first: Results) -> tuple[int, int, int]:
     """The numbers of tasks with a better, an equal and a worse return than in the first run."""
     change = final_returns(result) - final_returns(first)
-    counts = np.sum(change > SAME), np.sum(np.abs(change) <= SAME), np.sum(change < -SAME)
-    return " / ".join(map(str, counts))
+    equal = np.abs(change) <= SAME
+    return int(np.sum(change > SAME)), int(np.sum(equal)), int(np.sum(change < -SAME))
 
 
 def final_returns(result: Results) -> np.ndarray:
@@ -77,11 +103,19 @@ def _short(value: object) -> str:
 
 
 def as_csv(runs: Sequence[Path], results: Sequence[Results]) -> str:
-    """The final return of each task in each run, averaged over seeds, and the optimum where it is known."""
+    """The final return of each task in each run, and the optimum where it is known.
+
+    A run has a column with the mean over its seeds, and behind those of all runs a column for each seed.
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["task", "optimum", *map(str, runs)])
-    columns = [results[0].optimal_returns, *map(final_returns, results)]
+    by_seed = {
+        f"{folder} seed {index}": returns
+        for folder, result in zip(runs, results, strict=True)
+        for index, returns in enumerate(result.eval_returns[:, :, -1])
+    }
+    writer.writerow(["task", "optimum", *map(str, runs), *by_seed])
+    columns = [results[0].optimal_returns, *map(final_returns, results), *by_seed.values()]
     for index, row in enumerate(zip(*columns, strict=True)):
         numbers = ("" if np.isnan(number) else f"{number:.6g}" for number in row)
         writer.writerow([index, *numbers])

@@ -43,13 +43,41 @@ def test_differences_are_paired_by_task(tmp_path: Path, capsys: pytest.CaptureFi
     assert again[5] == "0 / 50 / 0"
 
     head, *lines = (tmp_path / "tasks.csv").read_text().splitlines()
-    assert head == f"task,optimum,{UCB},{PLAN},{UCB}"
+    seeds = [f"{folder} seed {index}" for folder in (UCB, PLAN) for index in range(3)]
+    assert head.split(",") == ["task", "optimum", *map(str, (UCB, PLAN, UCB)), *seeds]
     assert len(lines) == 50
     cells = [float(cell) for cell in lines[7].split(",")]
-    assert cells == pytest.approx(
+    alone = [load_results(folder).eval_returns[:, 7, -1] for folder in (UCB, PLAN)]
+    assert cells[5:] == pytest.approx(np.concatenate(alone).tolist(), abs=1e-4)
+    assert cells[:5] == pytest.approx(
         [7, load_results(UCB).optimal_returns[7], *(returns[f][7] for f in (UCB, PLAN, UCB))],
         abs=1e-4,
     )
+
+
+def test_a_comparison_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    main(CompareConfig(runs=(UCB, PLAN)))
+    row = rows_of(capsys.readouterr().out)[3]
+    main(CompareConfig(runs=(UCB, PLAN), json=True))
+    found = json.loads(capsys.readouterr().out)
+    first, plan = found["runs"]
+    assert (first["run"], first["method"], found["warnings"]) == (str(UCB), "ucb", [])
+    assert "difference" not in first
+    for cell, name in ((3, "difference"), (4, "improvement")):
+        assert row[cell] == "{value:.3f} [{low:.3f}, {high:.3f}]".format(**plan[name])
+    assert row[5] == "{better} / {equal} / {worse}".format(**plan["tasks"])
+
+
+def test_other_budgets_are_a_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(PLAN, other)
+    path = other / "summary.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "num_episodes": 40}))
+    main(CompareConfig(runs=(UCB, other), json=True))
+    out, err = capsys.readouterr()
+    told = f"the runs have different budgets of episodes: {UCB} 100, {other} 40"
+    assert err == f"warning: {told}\n"
+    assert json.loads(out)["warnings"] == [told]
 
 
 def test_what_makes_it_unequal_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
