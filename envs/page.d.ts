@@ -85,6 +85,8 @@ interface WorldPage extends WorldDrawing {
   hidesUnseen: boolean;
   /** The spots that can be chosen: rows and columns. */
   spots(facts: any): [number, number];
+  /** What is at a spot in a few words, for those who do not see it. */
+  tellSpot?(facts: any, task: any, spot: Spot): string;
   /** The goal that a spot stands for. */
   goalAt(facts: any, task: any, spot: Spot): Goal | null;
   /** A new random task. */

@@ -8,6 +8,7 @@ import subprocess
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -54,6 +55,34 @@ def run_js(world: World, data: dict[str, Any], change: Change = lambda source: s
         capture_output=True,
         text=True,
         check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def in_node(
+    modules: dict[str, Path], body: str, data: Any = None, with_document: bool = False
+) -> Any:
+    """The value that JavaScript returns under node.
+
+    Args:
+      modules: the modules that it uses; each one's exports are in a variable of this name.
+      body: the body of an asynchronous function, which returns a JSON value.
+      data: a JSON value, the variable ``data`` of the body.
+      with_document: whether there is a document, without layout (``pages_dom.js``).
+    """
+    assert NODE is not None
+    bundle = Bundle()
+    names = "".join(f"const {name} = {bundle.add(path)};" for name, path in modules.items())
+    document = (Path(__file__).parent / "pages_dom.js").read_text() if with_document else ""
+    script = (
+        f"{document}\n{bundle.source}{names}"
+        "const data = JSON.parse(require('fs').readFileSync(0, 'utf8'));"
+        f"(async () => {{ {body} }})().then((found) => {{ "
+        "require('fs').writeFileSync(1, JSON.stringify(found ?? null)); process.exit(0); });"
+    )
+    done = subprocess.run(
+        [NODE, "-e", script], input=as_text(data), capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)

@@ -15,6 +15,9 @@ const goalOf = (facts, things) => Float32Array.from(facts.objects, (_, thing) =>
 /** The objects that a goal names. @type {(goal: Goal) => number[]} */
 const thingsOf = (goal) => Array.from(goal.keys()).filter((thing) => goal[thing] > 0.5);
 
+/** The object in a cell, or -1. @type {(facts: Facts, spot: Spot) => number} */
+const thingAt = ({ objects }, spot) => objects.findIndex(([row, column]) => row === spot.row && column === spot.column);
+
 /** One episode. @implements {Play} */
 class Grid {
   /** @param {Facts} facts @param {Task} task */
@@ -48,7 +51,7 @@ class Grid {
     this.newlyOn = -1;
     if (this.done) return this.observe(0);
     const { facts, task } = this, { side } = facts;
-    const here = facts.objects.findIndex(([row, column]) => row === this.row && column === this.column);
+    const here = thingAt(facts, this);
     if (action === FLIP && here >= 0) {
       this.isOn[here] = !this.isOn[here];
       if (!this.wasOn[here]) this.newlyOn = here;
@@ -210,8 +213,13 @@ export const world = {
     ["agent", "ring and line: agent and its path"],
   ],
   spots: ({ side }) => [side, side],
+  tellSpot(facts, task, spot) {
+    const thing = thingAt(facts, spot), place = task.indexOf(thing);
+    if (thing < 0) return "empty";
+    return `object ${facts.letters[thing]}, ${place < 0 ? "not in the true order" : `number ${place + 1} of the true order`}`;
+  },
   goalAt(facts, _, spot) {
-    const thing = facts.objects.findIndex((/** @type {number[]} */ [row, column]) => row === spot.row && column === spot.column);
+    const thing = thingAt(facts, spot);
     return thing < 0 ? null : goalOf(facts, [thing]);
   },
   sampleTask(facts, random) {

@@ -294,6 +294,10 @@ export const world = {
     ["prompt", "best prompt so far"],
   ],
   spots: ({ side }) => [side, side],
+  tellSpot(facts, task, { row, column }) {
+    const isAt = (/** @type {number[]} */ place) => place[0] === row && place[1] === column;
+    return isAt(task.goal) ? "target" : isAt(facts.start) ? "start" : isWall(task, row, column) ? "wall" : "free";
+  },
   goalAt: (facts, task, { row, column }) => (isInside(facts, { row, column }) ? goalOf(facts, row, column) : null),
   sampleTask(facts, random) {
     const rows = randomWalls(facts, random), task = { rows, goal: facts.start };

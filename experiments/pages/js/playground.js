@@ -4,92 +4,39 @@ import { unpack } from "./arrays.js";
 import { curves } from "./chart.js";
 import { Policy, argmax, softmax } from "./decoder.js";
 import { byId, drawScene, element, fill, legendOf, onScheme, showPrompt, spotAt } from "./dom.js";
-import { Chance, Search, runEpisode, sampled } from "./search.js";
+import { announcer } from "./pace.js";
 import { farFrom } from "./seen.js";
+import { spotsBetween } from "./spots.js";
+import { Stage } from "./stage.js";
 
-/**
- * @typedef {{ name: string, summary: string, facts: any, tasks: { task: any, text: string }[], network: import("./decoder.js").Network,
- *   weights: import("./arrays.js").Packed, seen: import("./seen.js").SeenData | null, sha256: string, returnSpan: number, deterministic: boolean, keepRewarded: boolean }} WorldData
- */
+/** @typedef {import("./stage.js").WorldData} WorldData */
 
 const NUM_EPISODES = 100;
 const PAUSES = [900, 450, 220, 100, 40, 0]; // milliseconds between steps, by speed
-const CHANCE = new Chance();
+const DRAW_MS = 60; // a search draws its last episode this often
+const ACTING = ["find", "play", "step", "restart"]; // buttons that are off during a search
 
 /** Lets the page answer before a long computation goes on. */
 const breathe = () => new Promise((resolve) => setTimeout(resolve));
 
-/** One world with its policy, its task and the episode in progress. */
-class Stage {
-  /** @param {WorldPage} world @param {WorldData} data @param {Policy} policy @param {(goal: Goal) => boolean} isFar */
-  constructor(world, data, policy, isFar) {
-    this.world = world;
-    this.data = data;
-    this.policy = policy;
-    this.isFar = isFar;
-    /** @type {Goal[]} */
-    this.waypoints = [];
-    /** @type {any} */
-    this.task = data.tasks[0].task;
-    /** @type {any[]} */
-    this.moments = [];
-    /** @type {Spot} */
-    this.cursor = { row: 0, column: 0 };
-    this.play = world.play(data.facts, this.task);
-    /** @type {Float32Array} */
-    this.logits = new Float32Array(data.network.action_dim);
-    this.restart();
-  }
-
-  get goals() {
-    return [...this.waypoints, this.world.taskGoal(this.data.facts, this.task)];
-  }
-
-  /** Room for further goals before the task goal. */
-  get hasRoom() {
-    return this.waypoints.length < this.data.network.max_prompt_length - 1;
-  }
-
-  /** @param {any} task */
-  take(task) {
-    this.task = task;
-    this.restart();
-  }
-
-  restart() {
-    this.play = this.world.play(this.data.facts, this.task);
-    const timestep = this.play.reset(null);
-    this.moments = [this.play.moment()];
-    this.policy.begin(this.goals);
-    this.logits = this.policy.observe(timestep.obs);
-  }
-
-  /** @param {boolean} samples */
-  step(samples) {
-    if (this.play.done) return;
-    const action = samples ? sampled(this.logits, CHANCE) : argmax(this.logits);
-    const timestep = this.play.step(action);
-    this.moments.push(this.play.moment());
-    if (this.play.done) return;
-    this.policy.act(action);
-    this.logits = this.policy.observe(timestep.obs);
-  }
-}
-
-class Playground {
+export class Playground {
   /** @param {string[]} names @param {(world: number) => Promise<Stage>} stageOf builds a stage, which takes a moment */
   constructor(names, stageOf) {
     this.names = names;
     this.stageOf = stageOf;
-    /** @type {Map<number, Stage>} */
+    /** @type {Map<number, Promise<Stage>>} */
     this.stages = new Map();
     this.stage = /** @type {Stage} */ (/** @type {unknown} */ (null)); // set by ``choose``
+    this.numChosen = 0; // how often a world was chosen; the last choice counts
     this.mode = -1; // sets goals; else the number of an edit of the world
     this.timer = 0;
     this.searching = false;
-    /** @type {boolean | null} */
+    /** @type {boolean | null} what painting sets; null while nothing is painted */
     this.painted = null;
+    /** @type {Spot | null} where painting was last */
+    this.lastPainted = null;
     this.hasFocus = false;
+    this.announce = announcer(byId("said"));
   }
 
   get facts() {
@@ -97,13 +44,17 @@ class Playground {
   }
 
   async begin() {
+    await this.choose(0);
     fill(byId("worlds"), ...(this.names.length > 1 ? this.names : []).map((name, i) =>
       element("button", { "data-world": name, onclick: () => this.choose(i) }, name)));
-    await this.choose(0);
+    this.pressWorld();
     const listen = (/** @type {string} */ id, /** @type {string} */ type, /** @type {(event: any) => void} */ act) =>
       byId(id).addEventListener(type, act);
     listen("play", "click", () => this.togglePlay());
-    listen("step", "click", () => this.halted(() => this.stage.step(byId("sample").checked)));
+    listen("step", "click", () => {
+      this.halted(() => this.stage.step(byId("sample").checked));
+      this.announce(byId("verdict").textContent);
+    });
     listen("restart", "click", () => this.halted(() => this.stage.restart()));
     listen("speed", "input", () => this.timer && this.run());
     listen("seen", "change", () => this.show());
@@ -116,9 +67,10 @@ class Playground {
     });
     listen("find", "click", () => this.find());
     listen("stop", "click", () => (this.searching = false));
-    listen("stage", "pointerdown", (event) => this.point(event, true));
-    listen("stage", "pointermove", (event) => this.painted !== null && this.point(event, false));
-    for (const type of ["pointerup", "pointercancel", "pointerleave"]) listen("stage", type, () => (this.painted = null));
+    listen("stage", "click", (event) => this.click(event));
+    listen("stage", "pointerdown", (event) => this.beginPainting(event));
+    listen("stage", "pointermove", (event) => this.goOnPainting(event));
+    for (const type of ["pointerup", "pointercancel", "pointerleave"]) listen("stage", type, () => this.endPainting());
     listen("stage", "keydown", (event) => this.key(event));
     listen("stage", "focus", () => this.focus(byId("stage").matches(":focus-visible")));
     listen("stage", "blur", () => this.focus(false));
@@ -132,15 +84,18 @@ class Playground {
     this.show();
   }
 
-  /** @param {number} world */
+  /** Show a world. It may have to load; the world that was chosen last is shown. @param {number} world */
   async choose(world) {
     this.halt();
-    const stage = this.stages.get(world) ?? (await this.stageOf(world));
-    this.stages.set(world, stage);
+    const number = ++this.numChosen;
+    const loading = this.stages.get(world) ?? this.stageOf(world);
+    this.stages.set(world, loading);
+    const stage = await loading;
+    if (number !== this.numChosen) return;
+    this.halt(); // playing or a search that began while the world was loading
     this.stage = stage;
     document.title = `Playground: ${stage.data.name}`;
-    byId("worlds").querySelectorAll("button").forEach((/** @type {Element} */ button) =>
-      button.setAttribute("aria-pressed", String(button.getAttribute("data-world") === stage.data.name)));
+    this.pressWorld();
     fill(byId("task"), element("option", { value: "" }, "-"),
       ...stage.data.tasks.map(({ text }, i) => element("option", { value: i }, text ? `${i}: ${text}` : String(i))));
     byId("task").value = "0";
@@ -155,6 +110,12 @@ class Playground {
     stage.cursor = { row: rows >> 1, column: columns >> 1 };
     this.clearFound();
     this.setMode(-1);
+  }
+
+  /** Mark the button of the world that is shown. */
+  pressWorld() {
+    byId("worlds").querySelectorAll("button").forEach((/** @type {Element} */ button) =>
+      button.setAttribute("aria-pressed", String(button.getAttribute("data-world") === this.stage.data.name)));
   }
 
   clearFound() {
@@ -187,28 +148,75 @@ class Playground {
     this.halted(() => this.stage.take(task));
   }
 
-  /** @param {PointerEvent} event @param {boolean} isFirst */
-  point(event, isFirst) {
-    const spot = spotAt(byId("stage"), this.stage.world, this.facts, event);
-    if (spot) this.act(spot, isFirst);
+  /** The edit of the world that clicks make; undefined where they set goals. */
+  get edit() {
+    return this.stage.world.edits[this.mode];
   }
 
-  /** What a click or the Enter key does. @param {Spot} spot @param {boolean} isFirst */
-  act(spot, isFirst) {
+  /** @param {PointerEvent} event */
+  spotOf(event) {
+    return spotAt(byId("stage"), this.stage.world, this.facts, event);
+  }
+
+  /**
+   * A click, and not the press of a pointer, sets a goal: a finger that scrolls or pinches makes no click.
+   * @param {PointerEvent} event
+   */
+  click(event) {
+    const spot = event.button === 0 && !this.edit?.paints ? this.spotOf(event) : null;
+    if (spot) this.act(spot);
+  }
+
+  /** @param {PointerEvent} event */
+  beginPainting(event) {
+    if (!this.edit?.paints || event.button !== 0 || !event.isPrimary || this.searching) return;
+    const spot = this.spotOf(event);
+    if (spot) this.paint(spot);
+  }
+
+  /** @param {PointerEvent} event */
+  goOnPainting(event) {
+    const spot = this.painted !== null && event.isPrimary ? this.spotOf(event) : null;
+    if (spot) this.paint(spot);
+  }
+
+  endPainting() {
+    this.painted = this.lastPainted = null;
+  }
+
+  /** Paint all spots from the last one to this one, since a fast pointer skips some. @param {Spot} spot */
+  paint(spot) {
+    const { edit, facts, stage: { task } } = this;
+    this.painted ??= edit.paint ? edit.paint(facts, task, spot) : true;
+    const spots = spotsBetween(this.lastPainted ?? spot, spot);
+    this.lastPainted = spot;
+    this.changeTask(spots.reduce((changed, one) => edit.change(facts, changed, one, this.painted ?? true) ?? changed, task));
+  }
+
+  /** What a click or the Enter key does. @param {Spot} spot */
+  act(spot) {
     if (this.searching) return;
-    const { stage, facts } = this, edit = stage.world.edits[this.mode];
-    if (edit) {
-      if (isFirst) this.painted = edit.paints && edit.paint ? edit.paint(facts, stage.task, spot) : null;
-      const task = edit.change(facts, stage.task, spot, this.painted ?? true);
-      if (!task) return;
-      byId("task").value = "";
-      this.clearFound();
-      return this.halted(() => stage.take(task));
+    if (this.edit) {
+      this.paint(spot);
+      return this.endPainting();
     }
-    const goal = isFirst ? stage.world.goalAt(facts, stage.task, spot) : null;
+    const { stage } = this, goal = stage.world.goalAt(this.facts, stage.task, spot);
     if (!goal) return;
-    if (!stage.hasRoom) return void (byId("verdict").textContent = `A prompt has at most ${stage.data.network.max_prompt_length} goals.`);
+    if (!stage.hasRoom) {
+      const text = `A prompt has at most ${stage.data.network.max_prompt_length} goals.`;
+      byId("verdict").textContent = text;
+      return this.announce(text);
+    }
     this.setGoals([...stage.waypoints, goal]);
+    this.announce(stage.tellSpot(spot));
+  }
+
+  /** @param {any} task */
+  changeTask(task) {
+    if (task === this.stage.task) return;
+    byId("task").value = "";
+    this.clearFound();
+    this.halted(() => this.stage.take(task));
   }
 
   /** @param {KeyboardEvent} event */
@@ -220,11 +228,9 @@ class Playground {
       stage.cursor = { row, column };
       this.hasFocus = true;
       this.show();
-      byId("prompt-text").textContent = `Prompt (at row ${row}, column ${column})`;
-    } else if (event.key === "Enter" || event.key === " ") {
-      this.act(stage.cursor, true);
-      this.painted = null;
-    } else if (event.key === "Backspace") this.setGoals(stage.waypoints.slice(0, -1));
+      this.announce(stage.tellSpot(stage.cursor));
+    } else if (event.key === "Enter" || event.key === " ") this.act(stage.cursor);
+    else if (event.key === "Backspace") this.setGoals(stage.waypoints.slice(0, -1));
     else return;
     event.preventDefault();
   }
@@ -242,6 +248,7 @@ class Playground {
       this.stage.step(byId("sample").checked);
       if (this.stage.play.done) this.halt();
       this.show();
+      this.announce(byId("verdict").textContent);
     }, PAUSES[Number(byId("speed").value) - 1]);
   }
 
@@ -263,43 +270,52 @@ class Playground {
   async find() {
     this.halted(() => {});
     this.searching = true;
-    const { stage } = this, { data, world, task, policy } = stage;
-    const space = {
-      numSlots: data.network.max_prompt_length, numEpisodes: NUM_EPISODES, returnSpan: data.returnSpan,
-      deterministic: data.deterministic, keepRewarded: data.keepRewarded,
-    };
-    const search = new Search(space, world.taskGoal(data.facts, task), CHANCE);
-    /** @type {{ x: number, y: number }[]} */
-    const points = [];
-    for (const id of ["find", "play", "step", "restart"]) byId(id).disabled = true;
-    byId("stop").disabled = false;
+    const { stage } = this, { task } = stage;
+    this.setActing(false);
     byId("progress").hidden = false;
     let last = performance.now();
-    while (this.searching && points.length < NUM_EPISODES) {
-      const { goals, isGreedy } = search.ask();
-      const episode = runEpisode(policy, world.play(data.facts, task), goals, isGreedy, CHANCE);
-      search.tell(goals, episode);
-      const best = search.best();
-      points.push({ x: points.length + 1, y: data.deterministic ? best.entry : best.mean });
-      if (performance.now() - last < 60 && points.length < NUM_EPISODES) continue;
-      byId("progress").value = points.length;
-      byId("found").textContent = `Episode ${points.length} of ${NUM_EPISODES}: best return ${points[points.length - 1].y.toFixed(2)}`;
-      if (this.stage === stage) this.showOther(goals, episode.moments);
-      await breathe();
-      last = performance.now();
-    }
+    const { returns, prompt } = await stage.search(NUM_EPISODES, async (progress) => {
+      if (performance.now() - last >= DRAW_MS || progress.returns.length === NUM_EPISODES) {
+        if (this.stage === stage) this.showProgress(progress);
+        await breathe();
+        last = performance.now();
+      }
+      return this.searching;
+    });
     this.searching = false;
-    for (const id of ["find", "play", "step", "restart"]) byId(id).disabled = false;
-    byId("stop").disabled = true;
-    if (this.stage !== stage || stage.task !== task || !search.arms.length) return;
-    const optimum = world.optimum(data.facts, task);
+    this.setActing(true);
+    if (this.stage !== stage) return;
+    if (stage.task !== task) return this.show();
+    this.setGoals(prompt.slice(0, -1));
+    this.showFound(returns);
+  }
+
+  /** Turn the buttons on that act, and off that stops a search, or the other way round. @param {boolean} acts */
+  setActing(acts) {
+    for (const id of ACTING) byId(id).disabled = !acts;
+    byId("stop").disabled = acts;
+  }
+
+  /** @param {import("./stage.js").Progress} progress */
+  showProgress({ returns, goals, moments }) {
+    byId("progress").value = returns.length;
+    byId("found").textContent = `Episode ${returns.length} of ${NUM_EPISODES}: best return ${returns[returns.length - 1].toFixed(2)}`;
+    this.announce(byId("found").textContent);
+    this.showOther(goals, moments);
+  }
+
+  /** What a search found. @param {number[]} returns of the best prompt after each episode */
+  showFound(returns) {
+    const { optimum } = this.stage;
     const known = Number.isFinite(optimum) ? `, the optimum is ${optimum.toFixed(2)}` : "";
-    byId("found").textContent = `After ${points.length} episodes: return ${points[points.length - 1].y.toFixed(2)}${known}. Play shows the prompt.`;
-    if (points.length > 1) fill(byId("found-curve"), curves({
+    byId("found").textContent = `After ${returns.length} episodes: return ${returns[returns.length - 1].toFixed(2)}${known}. Play shows the prompt.`;
+    this.announce(byId("found").textContent);
+    if (returns.length < 2) return;
+    const points = returns.map((y, i) => ({ x: i + 1, y }));
+    fill(byId("found-curve"), curves({
       series: [{ label: "best prompt", color: "var(--accent)", points }], title: "Return of the best prompt so far", xLabel: "episode",
       lines: Number.isFinite(optimum) ? [{ label: "optimum", y: optimum }] : [],
     }));
-    this.setGoals(search.best().prompt.slice(0, -1));
   }
 
   /** Draw an episode of the search. @param {Goal[]} goals @param {any[]} moments */
@@ -328,7 +344,7 @@ class Playground {
 
   /** @param {Play} play */
   verdict(play) {
-    const { world, data, task } = this.stage, optimum = world.optimum(data.facts, task);
+    const { optimum } = this.stage;
     const best = Number.isFinite(optimum) ? ` (optimum ${optimum.toFixed(2)})` : "";
     const steps = `${play.numSteps} ${play.numSteps === 1 ? "step" : "steps"}`;
     if (!play.done) return play.numSteps ? `${steps}, return ${play.return_.toFixed(2)}` : `Ready${best}`;
