@@ -10,7 +10,6 @@ import re
 import shutil
 import subprocess
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ import jax
 import numpy as np
 import pytest
 from made_results import TINY, made_results
+from pages_data import Elements, config_of, data_of, saved
 from PIL import Image
 
 from envs.errors import DataError, UsageError
@@ -34,11 +34,10 @@ from experiments.playground import PlaygroundConfig
 from experiments.playground import main as playground_main
 from experiments.report import ReportConfig
 from experiments.report import main as report_main
-from experiments.store.result_files import load_results, save_results
+from experiments.store.result_files import load_results
 from experiments.store.results import Results
 from experiments.store.rows import read_row
 from experiments.store.seals import is_sealed
-from experiments.store.summary import summarize
 from mgpo_jax.methods import METHODS, Method
 from mgpo_jax.policy_files import load_policy
 
@@ -54,56 +53,9 @@ def made_worlds(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(WORLDS, "find", lambda name: made.get(name) or find(name))
 
 
-def saved(folder: Path, results: Results) -> Path:
-    summary = summarize(
-        results, policy_sha256="0" * 64, num_episodes=80, num_failed=0, cpu_seconds=1.0
-    )
-    save_results(folder, replace(results, summary=summary))
-    return folder
-
-
 @pytest.fixture
 def result(tmp_path: Path) -> Path:
     return saved(tmp_path / "result", made_results(config=config_of("tiny")))
-
-
-def config_of(env: str, method: str = "ucb", **more: Any) -> dict[str, Any]:
-    return {"env": env, "method": method, "policy": None, **more}
-
-
-class Elements(HTMLParser):
-    """The elements of a page, with the content of scripts and styles."""
-
-    def __init__(self, page: str) -> None:
-        super().__init__()
-        self.found: list[tuple[str, dict[str, str | None]]] = []
-        self.texts: dict[int, str] = {}
-        self.is_open = False
-        self.feed(page)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.found.append((tag, dict(attrs)))
-        self.is_open = True
-
-    def handle_endtag(self, tag: str) -> None:
-        self.is_open = False
-
-    def handle_data(self, data: str) -> None:
-        place = len(self.found) - 1
-        if self.is_open:
-            self.texts[place] = self.texts.get(place, "") + data
-
-    def of(self, tag: str) -> list[tuple[dict[str, str | None], str]]:
-        return [
-            (attrs, self.texts.get(place, ""))
-            for place, (name, attrs) in enumerate(self.found)
-            if name == tag
-        ]
-
-
-def data_of(page: str) -> Any:
-    (text,) = [text for attrs, text in Elements(page).of("script") if attrs.get("id") == "data"]
-    return json.loads(text)
 
 
 def test_modules_are_joined_each_once_and_behind_what_they_import(tmp_path: Path) -> None:
@@ -298,7 +250,7 @@ def test_several_runs_are_compared_with_the_first(tmp_path: Path, result: Path) 
     data = data_of(report([result, other, result]))
     assert [run["comparison"] != "" for run in data["runs"]] == [False, True]
     assert data["runs"][1]["comparison"].startswith("0.250")
-    assert len({run["color"] for run in data["runs"]}) == 2
+    assert len({run["colors"]["light"][0] for run in data["runs"]}) == 2
 
 
 def test_runs_on_other_tasks_are_refused(tmp_path: Path, result: Path) -> None:

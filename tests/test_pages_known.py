@@ -262,7 +262,7 @@ def in_node(results: Results, arrays: dict[str, np.ndarray], call: str) -> Any:
     }
     bundle = Bundle()
     log = f"{bundle.add(SCRIPTS / 'log.js')}.Log"
-    data = as_text({"label": "", "color": "", "facts": [], "arrays": packed(more | arrays)})
+    data = as_text({"label": "", "colors": {}, "facts": [], "arrays": packed(more | arrays)})
     plain = "(_, value) => (ArrayBuffer.isView(value) ? Array.from(value) : value)"
     script = (
         f"{bundle.source}{log}.of(JSON.parse(require('fs').readFileSync(0, 'utf8')))"

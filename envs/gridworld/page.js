@@ -135,7 +135,7 @@ function draw(context, facts, { task, goals, moments, earlier, cursor }, colors)
     context.strokeStyle = place < 0 ? colors.faint : colors.ink;
     context.lineWidth = 0.07;
     context.stroke();
-    write(context, letters[thing], column + 0.5, row + 0.54, 0.5, isOn && place >= 0 ? colors.onBox : place < 0 ? colors.faint : colors.ink);
+    write(context, letters[thing], column + 0.5, row + 0.54, 0.5, isOn && place >= 0 ? colors.onBox : place < 0 && !isOn ? colors.faint : colors.ink);
     if (place >= 0) disc(context, column + 1.0, row - 0.0, String(place + 1), colors.ink, colors.free);
     const named = goals.findIndex((goal) => thingsOf(goal).length === 1 && thingsOf(goal)[0] === thing);
     if (named >= 0) disc(context, column + 0.0, row - 0.0, String(named + 1), colors.prompt, colors.onDisc);

@@ -57,9 +57,14 @@ export function colorsOf() {
   return Object.fromEntries(names.map((name) => [name, style.getPropertyValue(`--${name}`).trim()]));
 }
 
+const DARK = "(prefers-color-scheme: dark)";
+
+/** Whether the page's present scheme is dark. */
+export const isDark = () => matchMedia(DARK).matches;
+
 /** Call when the scheme changes between light and dark. @param {() => void} draw */
 export function onScheme(draw) {
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
+  matchMedia(DARK).addEventListener("change", draw);
 }
 
 /**

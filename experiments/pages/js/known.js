@@ -13,6 +13,7 @@ export const hasKnown = (log) => log.hasArms || log.hasMap || log.hasOrder || lo
 
 /** What stands above it. @type {(log: Log) => string} */
 export function knownTitle(log) {
+  if (!hasKnown(log)) return "What the optimizer knew";
   const what = log.hasMap ? "its map" : log.hasOrder ? "the order" : log.hasWorths ? "the estimated returns of prompts" : "its arms";
   return `What the optimizer knew: ${what} after this episode`;
 }

@@ -4,16 +4,18 @@ import { mean, product, range, unpack } from "./arrays.js";
 
 /**
  * @typedef {import("./arrays.js").Packed} Packed
- * @typedef {{ label: string, color: string, facts: [string, string][], comparison: string, note: string, arrays: Packed }} RunData
+ * @typedef {{ label: string, colors: Record<string, string[]>, facts: [string, string][], comparison: string, note: string, arrays: Packed }} RunData
  * @typedef {{ goals: Goal[], pulls: number, mean: number, isNew: boolean, isChanged: boolean }} ArmRow
  */
 
 /** What an adaptation did: axes S seeds, N tasks, E episodes, R rounds, C judgements. */
 export class Log {
-  /** @param {RunData} data @param {Record<string, import("./arrays.js").Shaped>} arrays */
-  constructor(data, arrays) {
+  /** @param {RunData} data @param {Record<string, import("./arrays.js").Shaped>} arrays @param {number} [number] that of the run in the page */
+  constructor(data, arrays, number = 0) {
     this.data = data;
     this.arrays = arrays;
+    this.color = `var(--run-${number})`;
+    this.ink = `var(--run-${number}-ink)`; // of text on that color
     const [numSeeds, numTasks, numEpisodes] = arrays.returns.shape;
     this.numSeeds = numSeeds;
     this.numTasks = numTasks;
@@ -35,9 +37,9 @@ export class Log {
     this.reachedFrom = this.hasReached ? sums(arrays.reachedCounts.data) : new Uint32Array(0);
   }
 
-  /** @param {RunData} data */
-  static async of(data) {
-    return new Log(data, await unpack(data.arrays));
+  /** @param {RunData} data @param {number} [number] */
+  static async of(data, number) {
+    return new Log(data, await unpack(data.arrays), number);
   }
 
   /** @param {number} seed @param {number} task @param {number} episode */

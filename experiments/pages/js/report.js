@@ -1,20 +1,26 @@
 // The report: what was run, curves, all tasks, and a viewer that steps through every episode.
 
+import { addressOf, placeOf, writeAddress } from "./address.js";
 import { mean, range } from "./arrays.js";
 import { chartWidth, curves, scale, ticks } from "./chart.js";
-import { byId, drawScene, element, fill, legendOf, onScheme, showPrompt, svg } from "./dom.js";
+import { byId, drawScene, element, fill, isDark, legendOf, onScheme, showPrompt, svg } from "./dom.js";
 import { hasKnown, knownTitle, showKnown } from "./known.js";
 import { Log } from "./log.js";
+import { announcer, settled } from "./pace.js";
+import { timeline } from "./timeline.js";
 
 /**
  * @typedef {{ name: string, summary: string, facts: any, parts: string[] }} WorldData
- * @typedef {{ world: WorldData, tasks: { task: any, text: string }[], optimum: number[] | null, withEpisodes: boolean,
+ * @typedef {{ world: WorldData, tasks: { task: any, text: string }[], optimum: number[] | null, withEpisodes: boolean, notes: string[],
  *   pictures?: { name: string, source: string }[], runs: import("./log.js").RunData[] }} ReportData
- * @typedef {{ run: number, task: number, seed: number, episode: number }} Place episode counts from 0
+ * @typedef {import("./address.js").Place} Place
+ * @typedef {{ name: string, shown: string, by: (task: number) => number, value: (task: number) => number }} Order
+ *   shown: what the value of a task is, in words; tasks with the lowest ``by`` come first
  */
 
 const SOLVED = 1e-4; // a smaller regret counts as an optimal solution
 const PLAY_MS = 450;
+const ADDRESS_MS = 350; // the address follows once no other episode was chosen for so long
 
 /** Names for goals: the world's, those of its parts, or its numbers. @type {(world: WorldDrawing | null, data: WorldData) => (goal: Goal) => string} */
 function goalNamer(world, { facts, parts }) {
@@ -28,9 +34,9 @@ function goalNamer(world, { facts, parts }) {
 function factsTable(logs) {
   const names = logs[0].data.facts.map(([name]) => name);
   const rows = names.map((name, i) => ({ name, values: logs.map((log) => log.data.facts[i][1]) }));
-  const head = logs.map(({ data }) => {
+  const head = logs.map(({ data, color }) => {
     const swatch = element("span", { class: "swatch" });
-    swatch.style.background = data.color;
+    swatch.style.background = color;
     return element("th", { scope: "col" }, swatch, data.label);
   });
   return element("table", { class: "facts" },
@@ -47,7 +53,7 @@ function seriesOf(log, index) {
     const x = log.arrays.evalEpisodes.data[c];
     return log.numSeeds > 1 ? { x, y, low: y - std, high: y + std } : { x, y };
   });
-  return { label: log.data.label, color: log.data.color, dash: ["", "7 4", "2 3"][index % 3] || undefined, points };
+  return { label: log.data.label, color: log.color, dash: ["", "7 4", "2 3"][index % 3] || undefined, points };
 }
 
 class Report {
@@ -60,6 +66,8 @@ class Report {
     /** @type {Place} */
     this.place = { run: 0, task: 0, seed: 0, episode: logs[0].numEpisodes - 1 };
     this.timer = 0;
+    this.announce = announcer(byId("said"));
+    this.writeAddress = settled(writeAddress, ADDRESS_MS);
     /** @type {Map<number, any[]>} */
     this.walks = new Map();
   }
@@ -81,9 +89,11 @@ class Report {
 
   begin() {
     const { data, logs } = this;
+    this.setColors();
     document.title = `${data.world.name}: ${logs.map((log) => log.data.label).join(", ")}`;
     byId("title").textContent = `Adaptation to ${data.tasks.length} tasks of ${data.world.name}`;
     byId("summary").textContent = data.world.summary;
+    fill(byId("notes"), ...data.notes.map((note) => element("p", { class: "quiet" }, note)));
     fill(byId("head"), factsTable(logs));
     fill(byId("comparisons"), ...logs.slice(1).map((log) =>
       element("p", {}, `${log.data.label} minus ${logs[0].data.label}, paired by task, with 95 % intervals over seeds: ${log.data.comparison}.`)));
@@ -91,13 +101,24 @@ class Report {
     this.showPictures();
     this.prepareTasks();
     this.prepareViewer();
-    this.go(this.fromAddress());
-    window.addEventListener("hashchange", () => this.go(this.fromAddress()));
+    this.go(placeOf(location.hash, this.place));
+    window.addEventListener("hashchange", () => this.go(placeOf(location.hash, this.place)));
     window.addEventListener("resize", () => this.draw());
     onScheme(() => this.redraw());
   }
 
+  /** Give the runs their colors in the page's present scheme. */
+  setColors() {
+    const scheme = isDark() ? "dark" : "light", { style } = document.documentElement;
+    this.logs.forEach((log, i) => {
+      const [line, ink] = log.data.colors[scheme];
+      style.setProperty(`--run-${i}`, line);
+      style.setProperty(`--run-${i}-ink`, ink);
+    });
+  }
+
   redraw() {
+    this.setColors();
     this.drawThumbnails();
     this.draw();
   }
@@ -111,7 +132,7 @@ class Report {
     }));
     fill(byId("curves-legend"), ...logs.map((log, i) => {
       const line = svg("svg", { width: 34, height: 10, "aria-hidden": "true" },
-        svg("line", { x1: 0, x2: 30, y1: 5, y2: 5, stroke: log.data.color, "stroke-width": 3, "stroke-dasharray": ["", "7 4", "2 3"][i % 3] || null }));
+        svg("line", { x1: 0, x2: 30, y1: 5, y2: 5, stroke: log.color, "stroke-width": 3, "stroke-dasharray": ["", "7 4", "2 3"][i % 3] || null }));
       return element("span", { class: "entry" }, line, log.data.label);
     }), element("span", { class: "entry" }, "bands: standard deviation over seeds"));
   }
@@ -123,19 +144,23 @@ class Report {
       element("figure", {}, element("img", { src: source, alt: name }), element("figcaption", { class: "quiet" }, name))));
   }
 
-  /** What tasks can be sorted by. @returns {[string, (task: number) => number][]} */
+  /** What tasks can be sorted by. @returns {Order[]} */
   orders() {
-    const { data, logs } = this, log = this.log;
-    /** @type {[string, (task: number) => number][]} */
-    const orders = [
-      ["number", (task) => task],
-      ["gain, largest first", (task) => log.judgedMean(task, 0) - log.judgedMean(task, log.numJudged - 1)],
-    ];
-    const { optimum } = data;
-    if (optimum) orders.push(["regret, largest first", (task) => log.judgedMean(task, log.numJudged - 1) - optimum[task]]);
+    const { data: { optimum }, log, logs } = this;
     const final = (/** @type {Log} */ one, /** @type {number} */ task) => one.judgedMean(task, one.numJudged - 1);
-    for (const other of logs)
-      if (other !== log) orders.push([`loss against ${other.data.label}, largest first`, (task) => final(log, task) - final(other, task)]);
+    const gain = (/** @type {number} */ task) => final(log, task) - log.judgedMean(task, 0);
+    /** @type {Order[]} */
+    const orders = [
+      { name: "number", shown: "the mean return at the end", by: (task) => task, value: (task) => final(log, task) },
+      { name: "gain, largest first", shown: "the gain in mean return", by: (task) => -gain(task), value: gain },
+    ];
+    /** @type {(name: string, shown: string, lost: (task: number) => number) => void} */
+    const addLoss = (name, shown, lost) => orders.push({ name, shown, by: (task) => -lost(task), value: lost });
+    if (optimum) addLoss("regret, largest first", "the regret of the mean return at the end", (task) => optimum[task] - final(log, task));
+    for (const other of logs.filter((one) => one !== log)) {
+      const { label } = other.data;
+      addLoss(`loss against ${label}, largest first`, `by how much ${label} ended higher`, (task) => final(other, task) - final(log, task));
+    }
     return orders;
   }
 
@@ -147,7 +172,7 @@ class Report {
       byId(id).parentElement.hidden = this.logs.length < 2;
       byId(id).addEventListener("change", () => this.go({ ...this.place, run: Number(byId(id).value) }));
     }
-    byId("sort").addEventListener("change", () => this.sortTasks());
+    byId("sort").addEventListener("change", () => this.showTasks());
     const buttons = this.data.tasks.map(({ text }, task) => {
       const canvas = this.world ? element("canvas", { "aria-hidden": "true" }) : null;
       return element("button", { "data-task": task, title: text, onclick: () => this.chooseTask(task) }, canvas, element("span", {}));
@@ -162,26 +187,21 @@ class Report {
     byId("viewer").scrollIntoView({ behavior: "smooth" });
   }
 
-  sortTasks() {
-    const [, by] = this.orders()[byId("sort").selectedIndex] ?? this.orders()[0];
-    const order = range(this.data.tasks.length).sort((a, b) => by(a) - by(b) || a - b);
-    byId("tasks").append(...order.map((task) => this.buttons?.[task]));
-  }
-
   showTasks() {
-    const { log, data } = this, last = log.numJudged - 1, { optimum } = data;
-    const chosen = Math.max(byId("sort").selectedIndex, 0);
-    fill(byId("sort"), ...this.orders().map(([name], i) => element("option", { value: i, selected: i === chosen }, name)));
-    byId("tasks-note").textContent = "Below each task: its number and the mean return at the end." +
+    const { log, data, data: { optimum } } = this, last = log.numJudged - 1, orders = this.orders();
+    const chosen = Math.min(Math.max(byId("sort").selectedIndex, 0), orders.length - 1), order = orders[chosen];
+    fill(byId("sort"), ...orders.map(({ name }, i) => element("option", { value: i, selected: i === chosen }, name)));
+    byId("tasks-note").textContent = `Below each task: its number and ${order.shown}.` +
       (optimum ? " A double frame: optimal with every seed." : "");
     this.buttons?.forEach((button, task) => {
-      const value = log.judgedMean(task, last);
+      const value = order.value(task).toFixed(2);
       const solved = Boolean(optimum) && range(log.numSeeds).every((seed) => (optimum?.[task] ?? 0) - log.judged(seed, task, last) < SOLVED);
       button.classList.toggle("solved", solved);
-      button.querySelector("span").textContent = `${task}: ${value.toFixed(2)}`;
-      button.setAttribute("aria-label", `task ${task}, ${data.tasks[task].text}, return ${value.toFixed(2)}${solved ? ", solved" : ""}`);
+      button.querySelector("span").textContent = `${task}: ${value}`;
+      button.setAttribute("aria-label", `task ${task}, ${data.tasks[task].text}, ${order.shown}: ${value}${solved ? ", solved" : ""}`);
     });
-    this.sortTasks();
+    const sorted = range(data.tasks.length).sort((a, b) => order.by(a) - order.by(b) || a - b);
+    byId("tasks").append(...sorted.map((task) => this.buttons?.[task]));
     this.drawThumbnails();
   }
 
@@ -226,17 +246,6 @@ class Report {
     }, PLAY_MS);
   }
 
-  /** The place that the address names: task, seed, episode and perhaps run. @returns {Place} */
-  fromAddress() {
-    const numbers = location.hash.slice(1).split(",").map(Number);
-    const [task, seed, episode, run] = numbers.map((number) => (Number.isInteger(number) ? number : undefined));
-    if (!location.hash) return this.place;
-    return {
-      task: task ?? 0, seed: seed ?? 0, run: run ?? this.place.run,
-      episode: (episode ?? this.place.episode + 1) - 1,
-    };
-  }
-
   /** Show a place, or the nearest one that there is. @param {Place} wanted */
   go(wanted) {
     const within = (/** @type {number} */ value, /** @type {number} */ num) => Math.min(Math.max(value, 0), num - 1);
@@ -246,10 +255,8 @@ class Report {
     };
     if (before.run !== run || !this.shown) this.showRun();
     this.shown = true;
-    const { task, seed, episode } = this.place;
-    const hash = `#${task},${seed},${episode + 1}${run ? `,${run}` : ""}`;
-    if (location.hash !== hash) history.replaceState(null, "", hash);
     this.show();
+    this.writeAddress(addressOf(this.place));
   }
 
   showRun() {
@@ -278,13 +285,13 @@ class Report {
     const best = Math.max(...range(episode + 1).map((e) => log.return_(seed, task, e)));
     const optimum = data.optimum ? `, optimum ${data.optimum[task].toFixed(2)}` : "";
     byId("verdict").textContent = `Return ${log.return_(seed, task, episode).toFixed(2)} (best so far ${best.toFixed(2)}${optimum})`;
+    this.announce(`${byId("stage-title").textContent}. ${byId("verdict").textContent}`);
     const greedy = log.hasPrompts ? (log.ofRound("greedy", seed, task, episode) ? "greedy actions" : "sampled actions") : "";
     byId("kind").textContent = [data.tasks[task].text, greedy, this.logs.length > 1 ? this.logs[run].data.label : ""].filter(Boolean).join("; ");
-    if (log.hasPrompts) {
-      for (const [id, which] of /** @type {["chips" | "best", "choice" | "best"][]} */ ([["chips", "choice"], ["best", "best"]])) {
-        const prompt = log.ofRound(which, seed, task, episode);
-        showPrompt(byId(id), log.prompt(prompt).map(this.goalName), log.isFar(prompt));
-      }
+    for (const [id, which] of /** @type {["chips" | "best", "choice" | "best"][]} */ ([["chips", "choice"], ["best", "best"]])) {
+      const prompt = log.hasPrompts ? log.ofRound(which, seed, task, episode) : -1;
+      if (prompt < 0) fill(byId(id), element("span", { class: "quiet" }, "none"));
+      else showPrompt(byId(id), log.prompt(prompt).map(this.goalName), log.isFar(prompt));
     }
     fill(byId("returns"), this.returnsChart());
     this.draw();
@@ -327,29 +334,8 @@ class Report {
       const earlier = byId("visits").checked ? range(episode + 1).map((e) => this.walk(e)) : undefined;
       drawScene(byId("stage"), world, data.world.facts, { task: data.tasks[task].task, goals, moments: this.walk(episode), earlier });
     }
-    fill(byId("timeline-place"), log.hasReached ? this.timeline() : null);
+    fill(byId("timeline-place"), log.hasReached ? timeline(log, this.place, data.world.parts, this.goalName) : null);
     this.showKnown();
-  }
-
-  /** The goals that the episode reached, in the order of their steps. */
-  timeline() {
-    const { log, place: { task, seed, episode } } = this, reached = log.reached(seed, task, episode);
-    const names = [...new Set([...this.data.world.parts, ...reached.map(({ goal }) => this.goalName(goal))])].slice(0, 40);
-    const last = Math.max(1, ...range(log.numEpisodes).flatMap((e) => log.reached(seed, task, e).map(({ step }) => step)));
-    const width = chartWidth(640), longest = Math.max(0, ...names.map((name) => Math.min(name.length, 22)));
-    const left = Math.max(60, 20 + 7.6 * longest), row = 34, x = scale(0, last, left, width - 24), height = row * names.length + 34;
-    const text = reached.map(({ step, goal }) => `${this.goalName(goal)} in step ${step}`).join(", ") || "no goal was reached";
-    return svg("svg", { viewBox: `0 0 ${width} ${height}`, class: "chart timeline", role: "img", "aria-label": `Goals reached: ${text}` },
-      ...names.flatMap((name, i) => [
-        svg("line", { x1: left, x2: width - 12, y1: row * (i + 0.5), y2: row * (i + 0.5), class: "grid" }),
-        svg("text", { x: left - 10, y: row * (i + 0.5) + 4, "text-anchor": "end" }, name.slice(0, 22)),
-      ]),
-      ...ticks(0, last, 5).map((step) => svg("text", { x: x(step), y: height - 8, "text-anchor": "middle" }, String(step))),
-      svg("text", { x: 8, y: height - 8 }, "step"),
-      ...reached.flatMap(({ step, goal }, i) => {
-        const y = row * (names.indexOf(this.goalName(goal)) + 0.5);
-        return [svg("circle", { cx: x(step), cy: y, r: 11, fill: log.data.color }), svg("text", { x: x(step), y: y + 4.5, "text-anchor": "middle", class: "on" }, String(i + 1))];
-      }));
   }
 
   returnsChart() {
@@ -376,7 +362,7 @@ class Report {
     ...ticks(1, Math.max(2, log.numEpisodes), 5).map((e) => svg("text", { x: x(e - 1), y: height - 16, "text-anchor": "middle" }, String(e))),
     svg("text", { x: (left + width) / 2, y: height - 2, "text-anchor": "middle" }, "episode"),
     ...values.map((value, e) => svg("circle", {
-      cx: x(e), cy: y(value), r: e === episode ? 7 : 3.4, fill: isGreedy(e) || e === episode ? log.data.color : "none", stroke: log.data.color, "stroke-width": 1.3,
+      cx: x(e), cy: y(value), r: e === episode ? 7 : 3.4, fill: isGreedy(e) || e === episode ? log.color : "none", stroke: log.color, "stroke-width": 1.3,
     })));
     return element("div", {}, drawing, element("p", { class: "quiet" }, "Filled: greedy actions. Open: sampled actions. Large: this episode. Dashed line: optimum. Click to choose an episode."));
   }
@@ -389,7 +375,7 @@ class Report {
 
 /** @param {(WorldDrawing | null)[]} worlds @param {ReportData} data */
 export async function main(worlds, data) {
-  const logs = await Promise.all(data.runs.map((run) => Log.of(run)));
+  const logs = await Promise.all(data.runs.map((run, i) => Log.of(run, i)));
   new Report(worlds[0], data, logs).begin();
   document.body.dataset.ready = "yes";
 }
