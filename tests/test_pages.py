@@ -90,6 +90,20 @@ def test_other_module_syntax_is_refused(tmp_path: Path, source: str) -> None:
         Bundle().add(tmp_path / "a.js")
 
 
+def test_code_behind_a_comment_with_types_is_refused_and_other_comments_go(tmp_path: Path) -> None:
+    """The comments are removed; nothing between two of them may go with them."""
+    path = tmp_path / "a.js"
+    path.write_text("/** One. */\nexport const a = /** @type {any} */ (1);\n/**\n * Two.\n */\n")
+    bundle = Bundle()
+    bundle.add(path)
+    assert "const a = /** @type {any} */ (1);" in bundle.source
+    assert "One" not in bundle.source
+    assert "Two" not in bundle.source
+    path.write_text("/** @type {number} */ const b = 1;\nconst c = b;\n/** Three. */\n")
+    with pytest.raises(ValueError, match=r"a\.js: 'const b = 1;' must be on a line below"):
+        Bundle().add(path)
+
+
 def test_packed_arrays_come_back() -> None:
     rng = np.random.default_rng(0)
     arrays = {

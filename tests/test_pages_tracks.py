@@ -145,3 +145,50 @@ def test_marks_on_crafters_map_do_not_cover_each_other() -> None:
     apart = np.linalg.norm(marks[:, None] - marks, axis=-1)[np.triu_indices(9, 1)]
     assert apart.min() >= 2 * 1.25
     assert apart.max() < 14
+
+
+@needs_node
+def test_crafters_map_counts_the_visits_of_episodes() -> None:
+    """Each visited cell is covered once, besides the map; the agent's way is drawn in any case."""
+    walks = (
+        "[[[32, 32, 0], [32, 33, 0]], [[32, 32, 0], [33, 32, 0], [32, 32, 0]]].map(world.moments)"
+    )
+    task = json.dumps(["a" * 64] * 64)
+    scene = f"{{ task: {task}, goals: [], moments: {walks}[0], earlier: {walks} }}"
+    rects = in_node(f"(world.draw(context, facts, {scene}, {{}}), rects)")
+    assert sorted(rects[64:]) == [[32, 32, 1, 1], [32, 33, 1, 1], [33, 32, 1, 1]]
+    without = in_node(
+        f"(world.draw(context, facts, {{ ...{scene}, earlier: undefined }}, {{}}), rects)"
+    )
+    assert without == rects[:64]
+
+
+@needs_node
+def test_gridworld_shows_repeated_goals_and_the_order_of_switching() -> None:
+    """A goal that a prompt has twice shows both numbers, and so does an object that is switched twice."""
+    bundle = Bundle()
+    world = f"{bundle.add(ROOT / 'envs/gridworld/page.js')}.world"
+    facts = {"side": 5, "horizon": 9, "objects": [[1, 1], [3, 3]], "letters": "AB", "fewest": 1}
+    switches = [[0, 0], [0, 1], [1, 1], [1, 0]]  # B, A, and B once more
+    moments = [
+        {"row": 0, "column": 0, "isOn": [bool(on) for on in isOn], "numSolved": 0}
+        for isOn in switches
+    ]
+    goals = [[1, 0], [0, 1], [1, 0]]
+    script = f"""{bundle.source}
+    const facts = {json.dumps(facts)}, texts = [];
+    const kinds = {{ fillText: (text, x, y) => texts.push([text, Math.round(x), Math.round(y)]) }};
+    const context = new Proxy({{}}, {{ get: (_, name) => kinds[name] ?? (() => 0), set: () => true }});
+    const scene = {{ task: [1, 0], goals: {json.dumps(goals)}.map((goal) => Float32Array.from(goal)),
+      moments: {json.dumps(moments)} }};
+    {world}.draw(context, facts, scene, {{}});
+    console.log(JSON.stringify([texts, {world}.tell(facts, scene)]));"""
+    assert NODE is not None
+    done = subprocess.run([NODE, "-e", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    texts, told = json.loads(done.stdout)
+    assert ["1,3", 1, 1] in texts  # at the corners of the cells of A and B
+    assert ["2", 3, 3] in texts
+    assert ["2", 1, 2] in texts
+    assert ["1,3", 3, 4] in texts
+    assert "switched: B, A, B; on: A" in told

@@ -45,8 +45,9 @@ function unlocksOf(moments) {
 }
 
 /** @type {WorldDrawing["draw"]} */
-function draw(context, facts, { task, goals, moments }, colors) {
+function draw(context, facts, { task, goals, moments, earlier }, colors) {
   drawMap(context, facts, task);
+  drawVisits(context, facts, earlier ?? [], colors);
   drawWay(context, moments);
   goals.forEach((goal, i) => {
     const place = placeOf(facts, goal);
@@ -85,6 +86,20 @@ function drawMap(context, facts, task) {
       column = end;
     }
   });
+}
+
+/** Cells that episodes visited, darker the more often. @param {CanvasRenderingContext2D} context @param {Facts} facts @param {Moment[][]} walks @param {Colors} colors */
+function drawVisits(context, { side }, walks, colors) {
+  /** @type {Map<number, number>} */
+  const visits = new Map();
+  for (const { row, column } of walks.flat()) visits.set(row * side + column, (visits.get(row * side + column) ?? 0) + 1);
+  const most = Math.max(1, ...visits.values());
+  context.fillStyle = colors.visit;
+  for (const [cell, count] of visits) {
+    context.globalAlpha = 0.2 + 0.7 * Math.sqrt(count / most);
+    context.fillRect(cell % side, Math.floor(cell / side), 1, 1);
+  }
+  context.globalAlpha = 1;
 }
 
 /** The way, from white to orange in time. @param {CanvasRenderingContext2D} context @param {Moment[]} moments */

@@ -88,6 +88,10 @@ class Grid {
   }
 }
 
+/** The objects that were switched, on or off, in this order. @type {(moments: Moment[]) => number[]} */
+const switchesOf = (moments) => moments.slice(1).flatMap(({ isOn }, i) =>
+  isOn.flatMap((on, thing) => (on === moments[i].isOn[thing] ? [] : [thing])));
+
 /** @type {WorldPage["draw"]} */
 function draw(context, facts, { task, goals, moments, earlier, cursor }, colors) {
   const { side, objects, letters } = facts;
@@ -125,7 +129,7 @@ function draw(context, facts, { task, goals, moments, earlier, cursor }, colors)
     context.stroke();
   }
   context.globalAlpha = 1;
-  const last = moments[moments.length - 1];
+  const last = moments[moments.length - 1], switched = switchesOf(moments);
   objects.forEach((/** @type {number[]} */ [row, column], /** @type {number} */ thing) => {
     const place = task.indexOf(thing), isOn = Boolean(last?.isOn[thing]);
     context.beginPath();
@@ -137,8 +141,10 @@ function draw(context, facts, { task, goals, moments, earlier, cursor }, colors)
     context.stroke();
     write(context, letters[thing], column + 0.5, row + 0.54, 0.5, isOn && place >= 0 ? colors.onBox : place < 0 && !isOn ? colors.faint : colors.ink);
     if (place >= 0) disc(context, column + 1.0, row - 0.0, String(place + 1), colors.ink, colors.free);
-    const named = goals.findIndex((goal) => thingsOf(goal).length === 1 && thingsOf(goal)[0] === thing);
-    if (named >= 0) disc(context, column + 0.0, row - 0.0, String(named + 1), colors.prompt, colors.onDisc);
+    const named = goals.flatMap((goal, i) => (thingsOf(goal).length === 1 && thingsOf(goal)[0] === thing ? [i + 1] : []));
+    if (named.length) disc(context, column + 0.0, row - 0.0, named.join(","), colors.prompt, colors.onDisc);
+    const turns = switched.flatMap((one, i) => (one === thing ? [i + 1] : []));
+    if (turns.length) disc(context, column + 0.0, row + 1.0, turns.join(","), colors.agent, colors.onDisc);
   });
   if (moments.length) {
     const first = moments[0];
@@ -169,7 +175,7 @@ function disc(context, x, y, label, color, ink) {
   context.arc(x, y, 0.26, 0, 7);
   context.fillStyle = color;
   context.fill();
-  write(context, label, x, y + 0.02, 0.34, ink);
+  write(context, label, x, y + 0.02, label.length > 2 ? Math.max(0.6 / label.length, 0.12) : 0.34, ink);
 }
 
 /** @param {CanvasRenderingContext2D} context @param {string} text @param {number} x @param {number} y @param {number} size @param {string} color */
@@ -204,13 +210,14 @@ export const world = {
     if (!last) return `Grid with objects ${facts.letters}. True order ${task.map(name).join(", ")}.`;
     const on = last.isOn.flatMap((/** @type {boolean} */ isOn, /** @type {number} */ thing) => (isOn ? [name(thing)] : []));
     return `True order ${task.map(name).join(", ")}. Agent at row ${last.row}, column ${last.column} after ` +
-      `${moments.length - 1} steps; on: ${on.join(", ") || "none"}; ${last.numSolved} of ${task.length} in order.`;
+      `${moments.length - 1} steps; switched: ${switchesOf(moments).map(name).join(", ") || "none"}; ` +
+      `on: ${on.join(", ") || "none"}; ${last.numSolved} of ${task.length} in order.`;
   },
   legend: [
     ["target", "filled disc: switched on"],
     ["ink", "small number: position in the true order"],
-    ["prompt", "number: position in the prompt"],
-    ["agent", "ring and line: agent and its path"],
+    ["prompt", "number above: position in the prompt"],
+    ["agent", "ring and line: agent and its path; number below: when it switched the object, on or off"],
   ],
   spots: ({ side }) => [side, side],
   tellSpot(facts, task, spot) {

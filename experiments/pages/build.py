@@ -20,7 +20,8 @@ from typing import Any
 SCRIPTS = Path(__file__).parent / "js"
 IMPORT = re.compile(r'^import \{ (\w+(?:, \w+)*) \} from "(\./[\w-]+\.js)";$', re.M)
 EXPORT = re.compile(r"^export (?=(?:const|(?:async )?function\*?|class) (\w+))", re.M)
-TYPES = re.compile(r"^[ \t]*/\*\*.*?\*/[ \t]*\n", re.M | re.S)
+TYPES = re.compile(r"^[ \t]*/\*\*(?:(?!\*/).)*\*/([^\n]*)\n", re.M | re.S)
+"""A comment that begins with its line, and what follows it on its last line."""
 OTHER_SYNTAX = re.compile(r"^(?:import|export)\b.*$", re.M)
 
 
@@ -48,7 +49,7 @@ class Bundle:
         if path in above:
             raise ValueError(f"{path.name} imports itself through {above[-1].name}")
         if path not in self._names:
-            source = TYPES.sub("", path.read_text(encoding="utf-8"))
+            source = _without_types(path)
 
             def imported(match: re.Match[str]) -> str:
                 of = self.add(path.parent / match[2], (*above, path))
@@ -69,6 +70,21 @@ class Bundle:
     def source(self) -> str:
         """All modules as one script."""
         return '"use strict";\n' + "".join(self._parts)
+
+
+def _without_types(path: Path) -> str:
+    """The source of a module without its comments with types.
+
+    Raises:
+      ValueError: if code follows such a comment on its line.
+    """
+
+    def removed(match: re.Match[str]) -> str:
+        if code := match[1].strip():
+            raise ValueError(f"{path.name}: {code!r} must be on a line below the comment before it")
+        return ""
+
+    return TYPES.sub(removed, path.read_text(encoding="utf-8"))
 
 
 def script_of(entry: Path, worlds: Sequence[Path | None]) -> str:

@@ -266,7 +266,8 @@ class Report {
     byId("episode").max = log.numEpisodes;
     byId("arms-section").hidden = !hasKnown(log) && !log.data.note;
     byId("arms-title").textContent = knownTitle(log);
-    byId("visits-label").hidden = !this.canDraw || !log.hasActions;
+    byId("visits-label").hidden = !this.canDraw;
+    byId("visits-text").textContent = `visits of all ${log.trackStride > 1 ? "drawn " : ""}episodes up to here`;
     fill(byId("stage-place"), this.canDraw ? element("canvas", { class: "stage still", id: "stage", role: "img" }) : null);
     this.walks.clear();
     this.showTasks();
@@ -310,8 +311,9 @@ class Report {
   /** The moments of an episode, tracked or played again by the rules. @param {number} episode */
   walk(episode) {
     const { world, log, place: { task, seed } } = this, at = log.at(seed, task, episode);
-    if (log.hasTracks) return world?.moments?.(log.track(seed, task, episode)) ?? [];
-    if (!this.walks.has(at) && world?.play) {
+    if (log.hasTracks) {
+      if (!this.walks.has(at)) this.walks.set(at, world?.moments?.(log.track(seed, task, episode)) ?? []);
+    } else if (!this.walks.has(at) && world?.play) {
       const play = world.play(this.data.world.facts, this.data.tasks[task].task);
       play.reset(log.start(seed, task, episode));
       const moments = [play.moment()];
