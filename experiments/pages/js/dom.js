@@ -32,6 +32,12 @@ export function byId(id) {
   return found;
 }
 
+/** Say that the page is complete and can be used, to tests and to measurements of how long this took. */
+export function sayReady() {
+  document.body.dataset.ready = "yes";
+  performance.mark("ready");
+}
+
 /** Put children in the place of what an element holds. @param {Element} parent @param {...Child} children */
 export function fill(parent, ...children) {
   parent.replaceChildren(...children.filter(Boolean).map((child) => /** @type {string | Node} */ (child)));

@@ -3,7 +3,7 @@
 import { unpack } from "./arrays.js";
 import { curves } from "./chart.js";
 import { Policy, argmax, softmax } from "./decoder.js";
-import { byId, drawScene, element, fill, legendOf, onScheme, showPrompt, spotAt } from "./dom.js";
+import { byId, drawScene, element, fill, legendOf, onScheme, sayReady, showPrompt, spotAt } from "./dom.js";
 import { announcer } from "./pace.js";
 import { farFrom } from "./seen.js";
 import { spotsBetween } from "./spots.js";
@@ -359,5 +359,5 @@ export async function main(worlds, data) {
     return new Stage(worlds[i], of, new Policy(of.network, await unpack(of.weights)), await farFrom(of.seen));
   };
   await new Playground(data.worlds.map(({ name }) => name), stageOf).begin();
-  document.body.dataset.ready = "yes";
+  sayReady();
 }

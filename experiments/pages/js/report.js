@@ -3,7 +3,7 @@
 import { addressOf, placeOf, writeAddress } from "./address.js";
 import { mean, range } from "./arrays.js";
 import { chartWidth, curves, scale, ticks } from "./chart.js";
-import { byId, drawScene, element, fill, isDark, legendOf, onScheme, showPrompt, svg } from "./dom.js";
+import { byId, drawScene, element, fill, isDark, legendOf, onScheme, sayReady, showPrompt, svg } from "./dom.js";
 import { hasKnown, knownTitle, showKnown } from "./known.js";
 import { Log } from "./log.js";
 import { announcer, settled } from "./pace.js";
@@ -379,5 +379,5 @@ class Report {
 export async function main(worlds, data) {
   const logs = await Promise.all(data.runs.map((run, i) => Log.of(run, i)));
   new Report(worlds[0], data, logs).begin();
-  document.body.dataset.ready = "yes";
+  sayReady();
 }
