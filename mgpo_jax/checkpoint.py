@@ -57,7 +57,8 @@ def checkpoints(folder: Path, keep: int = 2) -> Iterator[ocp.CheckpointManager]:
             f"{folder} is not a folder; remove it to start the training from its first step"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    own = processes.index()
+    # The number by which Orbax knows this process, also where it works apart from the others.
+    own = jax.process_index()
     options = ocp.CheckpointManagerOptions(
         max_to_keep=keep,
         create=False,

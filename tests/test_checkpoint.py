@@ -18,7 +18,7 @@ from jax.flatten_util import ravel_pytree
 
 import envs
 from envs.errors import DataError
-from mgpo_jax import checkpoint
+from mgpo_jax import checkpoint, processes
 from mgpo_jax.checkpoint import (
     Snapshot,
     _named_leaves,
@@ -75,6 +75,16 @@ def test_state_comes_back(tmp_path: Path, params: dict) -> None:
     assert (found.state.step, found.measured, found.pending) == (7, [ROW], [PENDING])
     assert jax.tree.structure(found.state) == jax.tree.structure(blank)
     jax.tree.map(np.testing.assert_array_equal, found.state, train_state(params, 7))
+
+
+def test_a_process_that_works_apart_saves_under_its_own_number(
+    tmp_path: Path, params: dict, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Orbax counts processes as jax does, whichever of them work together at present."""
+    monkeypatch.setattr(jax, "process_index", lambda *args: 1)
+    with processes.apart(), checkpoints(tmp_path) as manager:
+        save_state(manager, snapshot(params, 3))
+    assert (tmp_path / "3").is_dir()
 
 
 def test_checkpoint_of_another_run(tmp_path: Path, params: dict) -> None:
