@@ -257,7 +257,8 @@ def _take_steps(
 ) -> TrainState:
     """Take the remaining gradient steps, with checkpoints and evaluations in between.
 
-    Without ``metrics`` and ``manager`` nothing is measured or saved; process 0 does that.
+    Without ``metrics`` and ``manager`` nothing is measured or saved; process 0 does that, and the others
+    wait until it has.
     """
     config, num_steps, state = run.config, run.config.train.steps, before.state
     batches = run.batches(state.step)
@@ -289,6 +290,9 @@ def _take_steps(
             if saves and metrics is not None:
                 left = [{k: float(v) for k, v in row.items()} for row in pending]
                 save_state(manager, Snapshot(state, metrics.rows, left), run.identity)
+            if saves or measures:
+                # The others wait here, where a request to stop cannot end them before all is saved.
+                processes.exchange(b"")
             if number and not done:
                 progress.close()
                 text = f"stopped at step {state.step} of {num_steps}; {go_on}"

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -18,14 +19,15 @@ from test_runner import Point, tasks_of, untrained
 from test_training import CONFIG, DATASET, NETWORK, WHOLE, parts_of
 
 from envs.errors import UsageError
-from experiments import joining, signals
+from experiments import joining, signals, training
 from experiments.datasets import _as_one
 from experiments.joining import Joined, check_flags
 from mgpo_jax import lanes, processes, programs, segments, sharding
+from mgpo_jax.checkpoint import Snapshot
 from mgpo_jax.methods import UCB
 from mgpo_jax.processes import DisagreementError, Door, Member, Team, connected
 from mgpo_jax.runner import sweep
-from mgpo_jax.training import Trainer
+from mgpo_jax.training import ASKED, Trainer, TrainState
 
 COLLECTIVE = re.compile(r"all-reduce|all-gather|all-to-all|collective-permute|reduce-scatter")
 
@@ -143,6 +145,41 @@ def test_what_differs_is_named_with_its_host(monkeypatch: pytest.MonkeyPatch) ->
     assert str(first) == str(second)
     said = "process 1 on host1 has the dataset's hash 'cd', not 'ab' as process 0 on host0 has"
     assert str(first).startswith(said)
+
+
+def test_nobody_ends_a_training_before_it_is_saved(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A signal ends a process that has left the steps at once, and jax then aborts the one that saves."""
+    own = threading.local()
+    monkeypatch.setattr(processes, "_together", lambda: own.team)
+    monkeypatch.setattr(training, "_check_same_weights", lambda state: None)
+    order: list[str] = []
+
+    def save(*args: Any) -> None:
+        time.sleep(0.3)
+        order.append("saved")
+
+    monkeypatch.setattr(training, "save_state", save)
+    row = {"loss": np.float32(0.5), ASKED: np.float32(0)}
+    config = SimpleNamespace(train=SimpleNamespace(steps=1), save_every=9, eval_every=9)
+    run: Any = SimpleNamespace(
+        config=config,
+        identity="",
+        batches=lambda first: iter([[]]),
+        trainer=SimpleNamespace(step=lambda state, *_: (state._replace(step=1), row)),
+        measure=lambda state: {"val/loss": 0.5},
+    )
+    metrics: Any = SimpleNamespace(rows=[], write=lambda *_: None)
+    before = Snapshot(TrainState({}, (), 0), [], [])
+    with teams(2) as (made, _):
+
+        def take(index: int) -> None:
+            own.team = made[index]
+            training._take_steps(run, before, None if index else metrics, None, lambda: 0, "")
+            order.append(f"process {index} ends")
+
+        assert at_once(lambda: take(0), lambda: take(1)) == [None, None]
+    assert order[0] == "saved"
+    assert len(order) == 3
 
 
 def test_one_process_needs_nobody() -> None:
