@@ -30,6 +30,7 @@ from mgpo_jax.processes import Member
 from mgpo_jax.settings import flag
 
 ARRIVING = 300  # seconds in which all processes must have started
+AFTER_US = 60  # seconds later, jax would abort the process; we end it first, with a message
 HEARTBEATS = 100  # seconds without a sign of life until jax gives up a process; we notice earlier
 LEAVING = 20  # seconds that jax waits for the others at shutdown, when all have reached it
 SAME = 2.0  # seconds within which an error common to all processes occurs in each of them
@@ -130,13 +131,18 @@ def _start(config: Joined) -> None:
         }
         if config.coordinator.startswith(("127.", "localhost:")):
             place["coordinator_bind_address"] = config.coordinator
+    where = config.coordinator or "the place that the scheduler names"
+    mend = "start all of them with the same --coordinator and --processes, and a --process each"
     try:
-        jax.distributed.initialize(
-            initialization_timeout=ARRIVING,
-            heartbeat_timeout_seconds=HEARTBEATS,
-            shutdown_timeout_seconds=LEAVING,
-            **place,
-        )
+        with _within(
+            ARRIVING, f"not all processes have met at {where} within {ARRIVING} s; {mend}"
+        ):
+            jax.distributed.initialize(
+                initialization_timeout=ARRIVING + AFTER_US,
+                heartbeat_timeout_seconds=HEARTBEATS,
+                shutdown_timeout_seconds=LEAVING,
+                **place,
+            )
     except ValueError:
         if place:
             raise
@@ -145,12 +151,23 @@ def _start(config: Joined) -> None:
             "the processes; give --coordinator HOST:PORT --processes N --process I"
         ) from None
     except RuntimeError as error:
-        where = config.coordinator or "the place that the scheduler names"
         reason = str(error).splitlines()[0]
-        raise DataError(
-            f"not all processes have met at {where} within {ARRIVING} s; start all of them with the same "
-            f"--coordinator and --processes, and a --process each ({reason})"
-        ) from None
+        raise DataError(f"the processes cannot meet at {where} ({reason}); {mend}") from None
+
+
+@contextmanager
+def _within(seconds: float, text: str) -> Iterator[None]:
+    """End this process with a one-line message if the block takes longer than ``seconds``.
+
+    jax itself would abort the process with a stack trace, which no Python code can catch.
+    """
+    timer = threading.Timer(seconds, _end, (text,))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def _connect(config: Joined) -> processes.Team:

@@ -116,6 +116,37 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield root
 
 
+ALONE = """
+import sys
+from experiments import joining
+joining.ARRIVING = 1
+flags = {"coordinator": sys.argv[1], "processes": 2, "process": int(sys.argv[2])}
+joining.join(joining.Joined(distributed=True, **flags))
+"""
+
+
+def test_a_process_whose_others_never_come_says_so() -> None:
+    """Whichever of the processes is the only one that was started."""
+    started, places = [], []
+    for number in ("0", "1"):
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            places.append(f"127.0.0.1:{free.getsockname()[1]}")
+        started.append(
+            subprocess.Popen(
+                [sys.executable, "-c", ALONE, places[-1], number],
+                cwd=ROOT, env={**os.environ, "JAX_PLATFORMS": "cpu"},
+                stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            )
+        )  # fmt: skip
+    for process, where in zip(started, places, strict=True):
+        out, err = process.communicate(timeout=LIMIT)
+        assert (process.returncode, out) == (1, "")
+        assert err == (
+            f"error: not all processes have met at {where} within 1 s; start all of them with the same "
+            "--coordinator and --processes, and a --process each\n"
+        )
+
+
 def both(words: str, place: Path) -> list[tuple[int, str, str]]:
     pair = Pair(words, [place, place])
     try:
