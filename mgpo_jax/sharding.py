@@ -31,13 +31,22 @@ AXIS = "data"
 
 def device_mesh(num_devices: int | None = None) -> Mesh:
     """A 1-D mesh named ``data`` over the first ``num_devices`` devices of this process (default: all)."""
-    devices = jax.local_devices()[:num_devices]
-    return Mesh(np.asarray(devices), (AXIS,))
+    devices = sorted(jax.local_devices(), key=lambda device: device.id)
+    return Mesh(np.asarray(devices[:num_devices]), (AXIS,))
 
 
 def mesh_of_all() -> Mesh:
-    """A 1-D mesh named ``data`` over the devices of all processes that work together."""
-    return device_mesh() if processes.count() == 1 else Mesh(np.asarray(jax.devices()), (AXIS,))
+    """A 1-D mesh named ``data`` over the devices of all processes that work together, in their order."""
+    return device_mesh() if processes.count() == 1 else Mesh(np.asarray(_devices_of_all()), (AXIS,))
+
+
+def _devices_of_all() -> list[Any]:
+    """The devices of all processes, process by process.
+
+    ``jax.devices()`` has this order on CPUs and GPUs. On TPUs it follows the places of the chips, and rows
+    that are put together process by process would be those of other lanes.
+    """
+    return sorted(jax.devices(), key=lambda device: (device.process_index, device.id))
 
 
 def devices_for(part_size: int) -> int:
@@ -157,7 +166,8 @@ def rows_of_processes(row: Array) -> Array:
     this."""
     heads = _heads()
     check_collective(heads)
-    own = jax.device_put(row, jax.local_devices()[0])[None]
+    (head,) = heads.local_devices
+    own = jax.device_put(row, head)[None]
     shape = (heads.devices.size, *row.shape)
     rows = jax.make_array_from_single_device_arrays(shape, spread(heads), [own])
     return _gathering(heads)(rows).addressable_data(0)
@@ -167,7 +177,7 @@ def rows_of_processes(row: Array) -> Array:
 def _heads() -> Mesh:
     """The mesh of one device of each process, so that no collective runs between devices of one process."""
     first: dict[int, Any] = {}
-    for device in jax.devices():
+    for device in _devices_of_all():
         first.setdefault(device.process_index, device)
     return Mesh(np.asarray([first[number] for number in sorted(first)]), (AXIS,))
 
@@ -243,7 +253,7 @@ def _with_others(mesh: Mesh) -> Mesh:
         return mesh
     found: list[Any] = []
     for number in range(jax.process_count()):
-        own = [device for device in jax.devices() if device.process_index == number]
+        own = [device for device in _devices_of_all() if device.process_index == number]
         found += own[: mesh.devices.size]
     return Mesh(np.asarray(found), (AXIS,))
 

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -303,6 +304,30 @@ def test_sums_of_accelerators_are_those_of_copies() -> None:
     (copied,) = sharding.gather_rows(mesh, tree)
     jax.tree.map(np.testing.assert_array_equal, row, copied)
     np.testing.assert_array_equal(WHOLE.indices, np.arange(8))
+
+
+@dataclass(frozen=True)
+class Chip:
+    """A device of a process."""
+
+    process_index: int
+    id: int
+
+
+def test_devices_are_in_the_order_of_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a slice of TPUs ``jax.devices()`` alternates between them."""
+    placed = [Chip(0, 0), Chip(0, 1), Chip(1, 4), Chip(1, 5), Chip(0, 2), Chip(0, 3), Chip(1, 6)]
+    monkeypatch.setattr(jax, "devices", lambda: placed)
+    monkeypatch.setattr(jax, "local_devices", lambda: [Chip(0, 2), Chip(0, 0)])
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    monkeypatch.setattr(processes, "count", lambda: 2)
+    assert [chip.id for chip in sharding.mesh_of_all().devices.flat] == [0, 1, 2, 3, 4, 5, 6]
+    heads = sharding._heads.__wrapped__()
+    own = sharding.device_mesh(1)
+    assert list(own.devices) == [Chip(0, 0)]
+    assert (
+        list(heads.devices) == list(sharding._with_others(own).devices) == [Chip(0, 0), Chip(1, 4)]
+    )
 
 
 def test_names_of_the_flags() -> None:
