@@ -22,7 +22,7 @@ from typing import Annotated, Any, NoReturn
 from annotated_types import Ge, Le
 
 from envs.errors import DataError, UsageError, printable, shown
-from experiments import signals
+from experiments import cards, signals
 from experiments.runtime import Common, Silent
 from mgpo_jax import processes
 from mgpo_jax.claims import clean_up
@@ -121,7 +121,7 @@ def _start(config: Joined) -> None:
 
     # The preemption service would catch SIGTERM; we answer requests to stop ourselves (``signals``).
     jax.config.update("jax_enable_preemption_service", False)
-    place: dict[str, Any] = {}
+    place: dict[str, Any] = {"local_device_ids": cards.own_cards(os.environ)}
     if config.coordinator is not None:
         place = {
             "coordinator_address": config.coordinator,
@@ -144,7 +144,7 @@ def _start(config: Joined) -> None:
                 **place,
             )
     except ValueError:
-        if place:
+        if config.coordinator is not None:
             raise
         raise UsageError(
             "--distributed found no environment variables of SLURM, Open MPI or a TPU slice that identify "

@@ -20,7 +20,7 @@ from test_runner import Point, tasks_of, untrained
 from test_training import CONFIG, DATASET, NETWORK, WHOLE, parts_of
 
 from envs.errors import UsageError
-from experiments import joining, signals, training
+from experiments import cards, joining, signals, training
 from experiments.datasets import _as_one
 from experiments.joining import Joined, check_flags
 from mgpo_jax import lanes, processes, programs, segments, sharding
@@ -328,6 +328,38 @@ def test_devices_are_in_the_order_of_processes(monkeypatch: pytest.MonkeyPatch) 
     assert (
         list(heads.devices) == list(sharding._with_others(own).devices) == [Chip(0, 0), Chip(1, 4)]
     )
+
+
+@pytest.mark.parametrize(
+    ("variables", "own"),
+    [
+        ({"CUDA_VISIBLE_DEVICES": "0,1,2,3", "SLURM_STEP_TASKS_PER_NODE": "1(x2)"}, [0, 1, 2, 3]),
+        ({"CUDA_VISIBLE_DEVICES": "0,1,2,3", "SLURM_STEP_TASKS_PER_NODE": "4(x2)"}, None),
+        ({"CUDA_VISIBLE_DEVICES": "2", "SLURM_STEP_TASKS_PER_NODE": "4(x2)"}, [0]),
+        ({"SLURM_STEP_TASKS_PER_NODE": "2,1(x2)", "SLURM_NODEID": "1"}, []),
+        ({"SLURM_STEP_TASKS_PER_NODE": "2,1(x2)", "SLURM_NODEID": "0"}, None),
+        ({"CUDA_VISIBLE_DEVICES": "4,5", "OMPI_COMM_WORLD_LOCAL_SIZE": "1"}, [0, 1]),
+        ({"CUDA_VISIBLE_DEVICES": "4,5", "OMPI_COMM_WORLD_LOCAL_SIZE": "2"}, None),
+        ({"JAX_LOCAL_DEVICE_IDS": "1", "OMPI_COMM_WORLD_LOCAL_SIZE": "1"}, None),
+        ({}, None),
+    ],
+)
+def test_the_gpus_of_a_process(variables: dict[str, str], own: list[int] | None) -> None:
+    assert cards.own_cards(variables) == own
+
+
+def test_a_process_alone_on_its_host_drives_all_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
+    """jax would give it the GPU of its local rank alone."""
+    given: dict[str, Any] = {}
+    monkeypatch.setattr(jax.distributed, "initialize", lambda **options: given.update(options))
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1,2,3")
+    monkeypatch.setenv("SLURM_STEP_TASKS_PER_NODE", "1(x2)")
+    service = jax.config.jax_enable_preemption_service
+    try:
+        joining._start(Joined(distributed=True))
+    finally:
+        jax.config.update("jax_enable_preemption_service", service)
+    assert given["local_device_ids"] == [0, 1, 2, 3]
 
 
 def test_names_of_the_flags() -> None:

@@ -1,0 +1,42 @@
+"""The GPUs of processes that run one command together, and which of them each uses.
+
+jax would give every process of SLURM or Open MPI the GPU with the number of its local rank. That leaves the
+other GPUs of a host idle if one process should drive all of them, and it fails if the scheduler shows every
+process its own GPU alone. The functions here read variables of the environment and do not import jax.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+
+def own_cards(environment: Mapping[str, str]) -> list[int] | None:
+    """The GPUs that this process of a scheduler should use, by their places among the visible ones.
+
+    Args:
+      environment: the environment variables of the process.
+
+    Returns:
+      An empty list for all GPUs; None to let jax choose the one with the local rank of this process.
+    """
+    if environment.get("JAX_LOCAL_DEVICE_IDS"):
+        return None  # the user has chosen, and jax reads this variable itself
+    visible = environment.get("CUDA_VISIBLE_DEVICES")
+    cards = [] if visible is None else list(filter(None, visible.split(",")))
+    if tasks_on_host(environment) == 1:
+        return list(range(len(cards)))
+    return [0] if len(cards) == 1 else None
+
+
+def tasks_on_host(environment: Mapping[str, str]) -> int | None:
+    """The number of processes that the scheduler has started on this host; None if it does not say.
+
+    SLURM writes ``2(x3),1`` for two processes on each of three hosts and one on a fourth.
+    """
+    if (counted := environment.get("OMPI_COMM_WORLD_LOCAL_SIZE", "")).isdecimal():
+        return int(counted)
+    found = re.findall(r"(\d+)(?:\(x(\d+)\))?", environment.get("SLURM_STEP_TASKS_PER_NODE", ""))
+    hosts = [int(tasks) for tasks, times in found for _ in range(int(times or 1))]
+    own = environment.get("SLURM_NODEID", "0")
+    return hosts[int(own)] if own.isdecimal() and int(own) < len(hosts) else None
