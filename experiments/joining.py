@@ -121,6 +121,7 @@ def _start(config: Joined) -> None:
 
     # The preemption service would catch SIGTERM; we answer requests to stop ourselves (``signals``).
     jax.config.update("jax_enable_preemption_service", False)
+    cards.choose_same_programs(os.environ)
     place: dict[str, Any] = {"local_device_ids": cards.own_cards(os.environ)}
     if config.coordinator is not None:
         place = {

@@ -318,7 +318,11 @@ def _check_same_weights(state: TrainState) -> None:
     Different kinds of processors run different programs, whose results differ in the last bits.
     """
     if processes.count() > 1:
-        processes.check_agreed({f"the hash of the weights at step {state.step}": hash_state(state)})
+        processes.check_agreed(
+            {f"the hash of the weights at step {state.step}": hash_state(state)},
+            "continue with --resume on processors of one kind; on GPUs, leave --xla_gpu_autotune_level=0 "
+            "in XLA_FLAGS, since programs that XLA chooses by timing them compute different last bits",
+        )
 
 
 def _means(rows: list[dict[str, Any]]) -> dict[str, float]:

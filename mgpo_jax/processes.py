@@ -33,6 +33,7 @@ MEETING = 60.0  # seconds in which all processes must have connected
 # TCP keepalive: after ``SILENT`` seconds without traffic, ``PROBES`` probes are sent, ``BETWEEN`` seconds
 # apart; a host that answers none of them counts as gone.
 SILENT, PROBES, BETWEEN = 10, 3, 5
+SAME = "start all processes with the same settings, programs and data"
 NETWORK = "check that the network and firewalls allow the connection"
 
 _HEAD = struct.Struct(">cIQ")  # kind of message, index of the sender, number of bytes that follow
@@ -364,8 +365,12 @@ def from_bytes(text: bytes) -> dict[str, np.ndarray]:
         return dict(file)
 
 
-def check_agreed(facts: Mapping[str, Any]) -> None:
-    """Check that all processes have the same facts, which are JSON values by a description of each.
+def check_agreed(facts: Mapping[str, Any], mend: str = SAME) -> None:
+    """Check that all processes have the same facts.
+
+    Args:
+      facts: JSON values by a description of each.
+      mend: what to do if they differ, for the message.
 
     Raises:
       DisagreementError: in all processes, if one differs from process 0; it names both and what differs.
@@ -378,10 +383,7 @@ def check_agreed(facts: Mapping[str, Any]) -> None:
             said = "; ".join(
                 f"{name} {shown(own.get(name))}, not {shown(found[0][name])}" for name in differing
             )
-            raise DisagreementError(
-                f"{member} has {said} as {team.members[0]} has; start all processes with the same "
-                "settings, programs and data"
-            )
+            raise DisagreementError(f"{member} has {said} as {team.members[0]} has; {mend}")
 
 
 def own_name() -> tuple[str, int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import socket
 import threading
@@ -348,9 +349,34 @@ def test_the_gpus_of_a_process(variables: dict[str, str], own: list[int] | None)
     assert cards.own_cards(variables) == own
 
 
+@pytest.mark.parametrize(
+    ("has", "platforms", "before", "after"),
+    [
+        (False, "", "--a=1", "--a=1"),
+        (True, "cpu", "--a=1", "--a=1"),
+        (True, "", "", "--xla_gpu_shard_autotuning=false --xla_gpu_autotune_level=0"),
+        (
+            True, "cuda,cpu", "--xla_gpu_autotune_level=2",
+            "--xla_gpu_autotune_level=2 --xla_gpu_shard_autotuning=false",
+        ),
+    ],
+)  # fmt: skip
+def test_gpus_run_the_same_programs(
+    has: bool, platforms: str, before: str, after: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert cards.has_plugin() in (True, False)  # whatever is installed here
+    monkeypatch.setattr(cards, "has_plugin", lambda: has)
+    variables = {"JAX_PLATFORMS": platforms, "XLA_FLAGS": before}
+    cards.choose_same_programs(variables)
+    assert variables["XLA_FLAGS"] == after
+
+
 def test_a_process_alone_on_its_host_drives_all_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
     """jax would give it the GPU of its local rank alone."""
     given: dict[str, Any] = {}
+    monkeypatch.setattr(cards, "has_plugin", lambda: True)
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    monkeypatch.setenv("XLA_FLAGS", "--a=1")
     monkeypatch.setattr(jax.distributed, "initialize", lambda **options: given.update(options))
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1,2,3")
     monkeypatch.setenv("SLURM_STEP_TASKS_PER_NODE", "1(x2)")
@@ -360,6 +386,7 @@ def test_a_process_alone_on_its_host_drives_all_gpus(monkeypatch: pytest.MonkeyP
     finally:
         jax.config.update("jax_enable_preemption_service", service)
     assert given["local_device_ids"] == [0, 1, 2, 3]
+    assert os.environ["XLA_FLAGS"].startswith("--a=1 --xla_gpu_shard_autotuning=false")
 
 
 def test_names_of_the_flags() -> None:
