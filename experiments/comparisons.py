@@ -249,10 +249,13 @@ def share_out(config: ReproduceConfig) -> None:
     """Distribute the missing cells of a comparison over the processes, each of which makes its share.
 
     The processes need a shared folder. Cells that start from the same trained network go to the same
-    process. A single process does nothing here: it makes the cells when the table requests them.
+    process, which also measures the rows of a cell for Table 3. A single process does nothing here: it
+    makes the cells when the table requests them.
     """
     if processes.count() == 1:
         return
+    from experiments import robustness  # which is made of this module
+
     groups: dict[Any, list[tuple[str, str]]] = {}
     for world in worlds_of(config):
         for method in methods_of(config):
@@ -262,7 +265,10 @@ def share_out(config: ReproduceConfig) -> None:
     own = list(groups.values())[processes.index() :: processes.count()]
     with processes.apart():
         for world, method in itertools.chain.from_iterable(own):
-            made(config, world, method)
+            if config.what == "table3":
+                list(robustness.rows_of(config, world, method))  # makes the cell, and its rows
+            else:
+                made(config, world, method)
     processes.exchange(b"")
 
 

@@ -17,6 +17,7 @@ from experiments.evaluation import Noise
 from experiments.robustness import Behind, Row
 from experiments.store.reproduce_settings import ReproduceConfig
 from experiments.store.summary import read_summary
+from mgpo_jax import processes
 
 CONFIG = ReproduceConfig(what="table3", env=("kitchen",), only=("ucb",))
 UCB = Path("results/kitchen/ucb").absolute()
@@ -93,6 +94,28 @@ def test_missing_rows_are_measured_once(unpublished: list[Noise], tmp_path: Path
     again = robustness.compare(config)
     assert unpublished == [Noise(action=0.1)]
     assert again.splitlines()[:10] == text.splitlines()[:10]
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_processes_share_the_measurements(
+    index: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each measures the rows of its cells, as if it were alone."""
+    measured: list[tuple[str, str, int]] = []
+
+    def rows_of(config: ReproduceConfig, world: str, method: str) -> Iterator[Row]:
+        measured.append((world, method, processes.count()))
+        yield Row(world, method, Noise(), None)
+
+    monkeypatch.setattr(robustness, "rows_of", rows_of)
+    members = [processes.Member(number, "here", number) for number in range(2)]
+    team = processes.Team(members, index, {}, lambda *_: None)
+    monkeypatch.setattr(team, "combine", lambda piece, make: b"")
+    monkeypatch.setattr(processes._present, "team", team)
+    config = replace(CONFIG, out=tmp_path, env=("kitchen", "grid"), only=("ucb", "bpe"))
+    comparisons.share_out(config)
+    worlds, chosen = comparisons.worlds_of(config), comparisons.methods_of(config)
+    assert measured == [(w, m, 1) for w in worlds for m in chosen][index::2]
 
 
 def test_the_cost_of_a_row_is_in_minutes() -> None:
