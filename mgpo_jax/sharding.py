@@ -217,11 +217,15 @@ class Adding:
     """
 
     def __init__(self, mesh: Mesh) -> None:
-        on_cpu = mesh.devices.flat[0].platform == "cpu"
+        on_cpu = _is_cpu(mesh)
         self._mesh, self._alone = mesh, processes.count() == 1
         self._copies = self._alone and (on_cpu or mesh.devices.size == 1)
         self._whole = None if on_cpu else _with_others(mesh)
         self._split_up: Any = None
+        if self._whole is not None and not self._alone:
+            # The first collective over these devices connects them, while all processes are here.
+            blank = split(mesh, np.zeros((mesh.devices.size, 1), np.float32))
+            jax.block_until_ready(sum_by_collective(mesh, self._whole, blank))
 
     def __call__(self, tree: Any) -> list[Any]:
         """The rows (or partial sums of them), each on the first device of this process."""
@@ -273,11 +277,15 @@ def sum_by_collective(mesh: Mesh, whole: Mesh, tree: Any) -> Float[Array, "N"]:
     return _summing(whole)(rows).addressable_data(0)
 
 
+def _is_cpu(mesh: Mesh) -> bool:
+    """Whether the devices of a mesh are cores of CPUs."""
+    return mesh.devices.flat[0].platform == "cpu"
+
+
 def check_collective(mesh: Mesh) -> None:
     """Raise an error if a collective would run between CPU devices of one process, which may deadlock."""
     owners = [device.process_index for device in mesh.devices.flat]
-    on_cpus = mesh.devices.flat[0].platform == "cpu"
-    assert not (on_cpus and len(set(owners)) < len(owners)), mesh
+    assert not (_is_cpu(mesh) and len(set(owners)) < len(owners)), mesh
 
 
 @cache

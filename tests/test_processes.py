@@ -389,5 +389,24 @@ def test_a_process_alone_on_its_host_drives_all_gpus(monkeypatch: pytest.MonkeyP
     assert os.environ["XLA_FLAGS"].startswith("--a=1 --xla_gpu_shard_autotuning=false")
 
 
+def test_accelerators_are_connected_before_the_first_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their first collective needs all processes within a time limit."""
+    mesh = sharding.device_mesh(1)
+    summed: list[Any] = []
+
+    def note(own: Any, whole: Any, tree: Any) -> Any:
+        summed.append((own, whole, tree.shape))
+        return tree
+
+    monkeypatch.setattr(sharding, "sum_by_collective", note)
+    monkeypatch.setattr(sharding, "_is_cpu", lambda mesh: False)
+    sharding.Adding(mesh)
+    assert summed == []
+    monkeypatch.setattr(processes, "count", lambda: 2)
+    monkeypatch.setattr(sharding, "_with_others", lambda mesh: mesh)
+    sharding.Adding(mesh)
+    assert summed == [(mesh, mesh, (1, 1))]
+
+
 def test_names_of_the_flags() -> None:
     assert joining.OF_PROCESSES == ("distributed", "coordinator", "processes", "process")
