@@ -43,8 +43,8 @@ class Joined(Common):
     """Flags of the commands that several processes can run together."""
 
     distributed: bool = False
-    """Run on several processes (docs/scale.md), started by SLURM, Open MPI or a TPU slice, or described by
-    the next three flags. All need the same command line, except for ``--process``."""
+    """Run on several processes (docs/scale.md), started by SLURM, Open MPI 4 or a TPU slice, or described
+    by the next three flags. All need the same command line, except for ``--process``."""
     coordinator: str | None = None
     """Address of process 0 for the others to connect to, as HOST:PORT."""
     processes: Annotated[int, Ge(1), Le(65_536)] | None = None
@@ -148,8 +148,9 @@ def _start(config: Joined) -> None:
         if config.coordinator is not None:
             raise
         raise UsageError(
-            "--distributed found no environment variables of SLURM, Open MPI or a TPU slice that identify "
-            "the processes; give --coordinator HOST:PORT --processes N --process I"
+            "--distributed found no environment variables of SLURM, Open MPI 4 or a TPU slice that "
+            "identify the processes (jax does not know those of Open MPI 5); give --coordinator HOST:PORT "
+            "--processes N --process I"
         ) from None
     except RuntimeError as error:
         reason = str(error).splitlines()[0]

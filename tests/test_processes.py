@@ -408,5 +408,21 @@ def test_accelerators_are_connected_before_the_first_step(monkeypatch: pytest.Mo
     assert summed == [(mesh, mesh, (1, 1))]
 
 
+def test_a_scheduler_that_jax_does_not_know(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Processes of Open MPI 5 have no variable that says where they meet."""
+
+    def fail(**options: Any) -> None:
+        raise ValueError("coordinator_address should be defined.")
+
+    monkeypatch.setattr(jax.distributed, "initialize", fail)
+    monkeypatch.setenv("OMPI_COMM_WORLD_SIZE", "2")
+    service = jax.config.jax_enable_preemption_service
+    try:
+        with pytest.raises(UsageError, match=r"does not know those of Open MPI 5\); give --coord"):
+            joining._start(Joined(distributed=True))
+    finally:
+        jax.config.update("jax_enable_preemption_service", service)
+
+
 def test_names_of_the_flags() -> None:
     assert joining.OF_PROCESSES == ("distributed", "coordinator", "processes", "process")
