@@ -201,8 +201,7 @@ def _connect(config: Joined) -> processes.Team:
         links = door.let_in(members)
     else:
         _, _, port, password = told[0]
-        named = [config.coordinator.rpartition(":")[0].strip("[]")] if config.coordinator else []
-        places = [*named, members[0].host]
+        places = [*_host_of_first(), members[0].host]
         links = {0: processes.connected(places, port, password, jax.process_index())}
     told_to_resume = GO_ON["resume" if hasattr(config, "resume") else ""]
     return processes.Team(
@@ -211,6 +210,14 @@ def _connect(config: Joined) -> processes.Team:
         links,
         lambda event, member, text: _react(event, member, text, told_to_resume),
     )
+
+
+def _host_of_first() -> list[str]:
+    """The address at which jax has reached process 0, which may differ from the name of its host."""
+    from jax._src import distributed  # jax has no public function for this
+
+    address = getattr(distributed.global_state, "coordinator_address", None) or ""
+    return [host] if (host := address.rpartition(":")[0].strip("[]")) else []
 
 
 @contextmanager

@@ -30,6 +30,7 @@ from envs.errors import DataError, shown
 Value = TypeVar("Value")
 
 MEETING = 60.0  # seconds in which all processes must have connected
+GREETING = 5.0  # seconds in which a process that has connected must say the password
 # TCP keepalive: after ``SILENT`` seconds without traffic, ``PROBES`` probes are sent, ``BETWEEN`` seconds
 # apart; a host that answers none of them counts as gone.
 SILENT, PROBES, BETWEEN = 10, 3, 5
@@ -190,10 +191,14 @@ def _unpacked(text: bytes) -> Iterator[bytes]:
 
 
 class Door:
-    """The listening socket on which process 0 waits for the others, who must know the password."""
+    """The listening socket on which process 0 waits for the others, who must know the password.
+
+    Args:
+      only_here: whether all processes run on this host, so that no other host may connect.
+    """
 
     def __init__(self, only_here: bool) -> None:
-        self._listening = socket.create_server(("127.0.0.1" if only_here else "", 0))
+        self._listening = socket.create_server(("127.0.0.1", 0)) if only_here else _open_to_all()
         self.password = secrets.token_bytes(16)
         self.port = self._listening.getsockname()[1]
 
@@ -213,19 +218,34 @@ class Door:
                 self._listening.settimeout(max(end - time.monotonic(), 0.01))
                 try:
                     link, _ = self._listening.accept()
-                    link.settimeout(MEETING)
-                    said = _received(link, len(self.password) + 4)
                 except OSError:
                     missing = next(one for one in members[1:] if one.number not in links)
                     raise DataError(
                         f"{missing} has not connected to process 0 on {members[0].host} within "
                         f"{MEETING:.0f} s; {NETWORK}"
                     ) from None
-                if secrets.compare_digest(said[:-4], self.password):
-                    links[struct.unpack(">I", said[-4:])[0]] = _with_keepalive(link)
-                else:
+                if (number := self._greeted(link)) is None:
                     link.close()
+                else:
+                    links[number] = _with_keepalive(link)
         return links
+
+    def _greeted(self, link: socket.socket) -> int | None:
+        """The index of the process at the other end; None for a stranger, who may say nothing at all."""
+        said = b""
+        with suppress(OSError):
+            link.settimeout(GREETING)
+            said = _received(link, len(self.password) + 4)
+        known = secrets.compare_digest(said[:-4], self.password)
+        return struct.unpack(">I", said[-4:])[0] if known else None
+
+
+def _open_to_all() -> socket.socket:
+    """A listening socket on all addresses of this host, those of IPv6 too where the system has them."""
+    if socket.has_dualstack_ipv6():
+        with suppress(OSError):
+            return socket.create_server(("", 0), family=socket.AF_INET6, dualstack_ipv6=True)
+    return socket.create_server(("", 0))
 
 
 def connected(places: Sequence[str], port: int, password: bytes, index: int) -> socket.socket:

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax._src import distributed
 from test_runner import Point, tasks_of, untrained
 from test_training import CONFIG, DATASET, NETWORK, WHOLE, parts_of
 
@@ -131,6 +132,48 @@ def test_strangers_are_not_let_in() -> None:
         socket.create_connection(("127.0.0.1", door.port), timeout=5)
     for link in (stranger, own, links[1]):
         link.close()
+
+
+def test_a_stranger_that_says_nothing_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The others are let in all the same."""
+    monkeypatch.setattr(processes, "GREETING", 0.1)
+    door = Door(only_here=True)
+    silent = socket.create_connection(("127.0.0.1", door.port))
+    own = connected(["127.0.0.1"], door.port, door.password, 1)
+    links = door.let_in([Member(0, "here", 1), Member(1, "there", 2)])
+    assert list(links) == [1]
+    silent.settimeout(5)
+    assert silent.recv(1) == b""
+    for link in (silent, own, links[1]):
+        link.close()
+
+
+def has_ipv6() -> bool:
+    """Whether a process may connect to this host by an address of IPv6."""
+    try:
+        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+    except OSError:
+        return False
+    return socket.has_dualstack_ipv6()
+
+
+@pytest.mark.skipif(not has_ipv6(), reason="needs IPv6")
+def test_the_door_is_open_to_both_kinds_of_addresses() -> None:
+    door = Door(only_here=False)
+    own = [connected(["127.0.0.1"], door.port, door.password, 1)]
+    own.append(connected(["::1"], door.port, door.password, 2))
+    links = door.let_in([Member(number, "here", number) for number in range(3)])
+    assert sorted(links) == [1, 2]
+    for link in (*own, *links.values()):
+        link.close()
+
+
+def test_process_0_is_looked_for_where_jax_has_found_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its own name for its host may be unknown elsewhere."""
+    state = distributed.global_state
+    for address, host in (("node0:123", ["node0"]), ("[fe80::1]:123", ["fe80::1"]), (None, [])):
+        monkeypatch.setattr(state, "coordinator_address", address)
+        assert joining._host_of_first() == host
 
 
 def test_what_differs_is_named_with_its_host(monkeypatch: pytest.MonkeyPatch) -> None:
