@@ -276,6 +276,7 @@ def _react(event: str, member: Member, text: str, go_on: str) -> None:
         _end(f"{member} (pid {member.pid}) has ended unexpectedly; {go_on}")
 
 
+_ending = threading.Event()  # set when this process ends because of another one
 _failed = threading.Event()  # set when this process fails because of an error of its own
 _faults: dict[int, str] = {}  # error messages of other processes, by their numbers
 
@@ -285,6 +286,8 @@ def leave_failed(team: processes.Team, line: str, message: str, code: int) -> No
 
     An error that process 0 meets, too, is only printed there.
     """
+    if _ending.is_set():  # another thread has said why, and ends the process
+        time.sleep(2 * SAME)
     _failed.set()
     team.tell(processes.FAILED, message)
     end = time.monotonic() + SAME
@@ -298,10 +301,16 @@ def leave_failed(team: processes.Team, line: str, message: str, code: int) -> No
 
 
 def _end(text: str) -> NoReturn:
-    """Exit because of another process, with a one-line message."""
+    """Exit because of another process, with a one-line message.
+
+    Process 0 waits for the others to end, too, so that they print this line before jax aborts them.
+    """
+    _ending.set()
     try:
         _print(f"error: {printable(text)}")
         clean_up()
+        if (team := processes.team()) is not None and not team.index:
+            team.outlast(SAME)
     finally:
         os._exit(1)
 

@@ -132,11 +132,13 @@ class Team:
         """Wait for the others to end, for at most ``seconds``.
 
         If process 0 ends before another process without shutting down properly, jax aborts that process
-        with pages of text.
+        with pages of text. A thread that receives from a process may call this, and does not wait for that
+        one, whose connection has told it to end.
         """
         end = time.monotonic() + seconds
         for reader in self._readers:
-            reader.join(max(end - time.monotonic(), 0))
+            if reader is not threading.current_thread():
+                reader.join(max(end - time.monotonic(), 0))
 
     def _send(self, number: int, kind: bytes, text: bytes, source: int | None = None) -> None:
         source = self.index if source is None else source

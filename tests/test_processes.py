@@ -112,6 +112,29 @@ def test_a_process_that_is_gone_is_missed_by_all_others() -> None:
         assert heard[2] == []
 
 
+def test_process_0_ends_after_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """jax would abort those that have not printed yet why they end."""
+    ended: list[str] = []
+    monkeypatch.setattr(joining, "clean_up", lambda: None)
+    monkeypatch.setattr(joining, "_ending", threading.Event())
+    monkeypatch.setattr(joining.os, "_exit", lambda code: ended.append("process 0"))
+
+    def hear(event: str, member: Member, text: str) -> None:
+        joining._end(f"{member} is gone")  # in the thread that receives from process 1
+
+    with teams(3) as (made, _):
+        monkeypatch.setattr(made[0], "_heard", hear)
+        monkeypatch.setattr(processes._present, "team", made[0])
+        made[1].leave(wait=False)
+        time.sleep(0.3)
+        ended.append("process 2")
+        made[2].leave(wait=False)
+        soon(lambda: len(ended) > 1)
+        monkeypatch.setattr(processes._present, "team", None)
+    assert ended[:2] == ["process 2", "process 0"]
+    assert joining._ending.is_set()
+
+
 def test_who_has_come_to_the_end_is_not_missed() -> None:
     with teams(3) as (made, heard):
         at_once(*[lambda i=i: made[i].leave(wait=True) for i in range(3)])
