@@ -253,6 +253,7 @@ def _facts(config: Joined) -> Mapping[str, Any]:
         "the number of devices": len(devices),
         "the kind of devices": devices[0].device_kind,
         "XLA_FLAGS": os.environ.get("XLA_FLAGS", ""),
+        "JAX_DEFAULT_MATMUL_PRECISION": jax.config.jax_default_matmul_precision,
     }
 
 

@@ -490,5 +490,13 @@ def test_a_scheduler_that_jax_does_not_know(monkeypatch: pytest.MonkeyPatch) -> 
         jax.config.update("jax_enable_preemption_service", service)
 
 
+def test_the_precision_of_products_must_agree() -> None:
+    """It changes results, and may be set in the environment of one host only."""
+    name = "JAX_DEFAULT_MATMUL_PRECISION"
+    assert joining._facts(Joined())[name] is None
+    with jax.default_matmul_precision("highest"):
+        assert joining._facts(Joined())[name] == "highest"
+
+
 def test_names_of_the_flags() -> None:
     assert joining.OF_PROCESSES == ("distributed", "coordinator", "processes", "process")
