@@ -245,6 +245,7 @@ def _facts(config: Joined) -> Mapping[str, Any]:
     made, devices = provenance(), jax.local_devices()
     settings = to_json(config)
     own = ("process", "debug", "quiet", "config")
+    precision = jax.config.jax_default_matmul_precision  # type: ignore[attr-defined]
     facts = {flag(name): value for name, value in settings.items() if name not in own}
     return {
         **facts,
@@ -253,7 +254,7 @@ def _facts(config: Joined) -> Mapping[str, Any]:
         "the number of devices": len(devices),
         "the kind of devices": devices[0].device_kind,
         "XLA_FLAGS": os.environ.get("XLA_FLAGS", ""),
-        "JAX_DEFAULT_MATMUL_PRECISION": jax.config.jax_default_matmul_precision,
+        "JAX_DEFAULT_MATMUL_PRECISION": precision,
     }
 
 
