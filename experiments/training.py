@@ -205,19 +205,16 @@ def _train_and_save(run: Run, go_on: str) -> None:
     config, folder = run.config, run.folder
     if config.data.data_folder is None:  # otherwise it was printed with the recipe
         print(schedule(config), file=sys.stderr)
-    with checkpoints(folder / runs.CHECKPOINTS) as manager:
-        blank = run.initial_state()
-        before = restore_state(manager, blank, run.identities) if config.resume else None
-        before = before or Snapshot(blank, [], [])
-        rows = before.measured
-        if rows is None:  # a checkpoint of an older version
-            rows = salvaged_rows(folder / METRICS, before.state.step)
-        if config.resume:
-            print(f"resuming {folder} at step {before.state.step}", file=sys.stderr)
-        metrics = Metrics(folder, config, rows)
-        before = before._replace(state=state_of_first(before.state, blank))
-        with asked_to_stop() as stopping:
-            state = _take_steps(run, before, metrics, manager, stopping, go_on)
+    blank = run.initial_state()
+    before = _snapshot_to_resume(run, blank) or Snapshot(blank, [], [])
+    rows = before.measured
+    if rows is None:  # a checkpoint of an older version
+        rows = salvaged_rows(folder / METRICS, before.state.step)
+    if config.resume:
+        print(f"resuming {folder} at step {before.state.step}", file=sys.stderr)
+    metrics = Metrics(folder, config, rows)
+    before = before._replace(state=state_of_first(before.state, blank))
+    state = _train_together(run, before, metrics, go_on)
     made = {"env": config.env, "config": to_json(config), "steps": state.step, **run.origin}
     policy = folder / runs.POLICY
     seen = seen_in(run.fit, run.init.seen_goals if run.init else None)
@@ -230,8 +227,21 @@ def _train_and_save(run: Run, go_on: str) -> None:
 def _train_along(run: Run, go_on: str) -> None:
     """Take the steps of a training in a process other than 0, which writes nothing."""
     state = state_of_first(None, run.initial_state())
-    with asked_to_stop() as stopping:
-        _take_steps(run, Snapshot(state, [], []), None, None, stopping, go_on)
+    _train_together(run, Snapshot(state, [], []), None, go_on)
+
+
+def _snapshot_to_resume(run: Run, blank: TrainState) -> Snapshot | None:
+    """The newest checkpoint of a run that is resumed, read by process 0 alone; None if there is none."""
+    if not run.config.resume:
+        return None
+    with processes.apart(), checkpoints(run.folder / runs.CHECKPOINTS) as manager:
+        return restore_state(manager, blank, run.identities)
+
+
+def _train_together(run: Run, before: Snapshot, metrics: Metrics | None, go_on: str) -> TrainState:
+    """Take the remaining steps in each process, until they are done or one of them is asked to stop."""
+    with checkpoints(run.folder / runs.CHECKPOINTS) as manager, asked_to_stop() as stopping:
+        return _take_steps(run, before, metrics, manager, stopping, go_on)
 
 
 def _describe_continuation(config: TrainConfig, trained: int) -> str:
@@ -257,8 +267,8 @@ def _take_steps(
 ) -> TrainState:
     """Take the remaining gradient steps, with checkpoints and evaluations in between.
 
-    Without ``metrics`` and ``manager`` nothing is measured or saved; process 0 does that, and the others
-    wait until it has.
+    Without ``metrics`` nothing is measured; process 0 does that, and the others wait until it has. All
+    processes save checkpoints together.
     """
     config, num_steps, state = run.config, run.config.train.steps, before.state
     batches = run.batches(state.step)
@@ -287,10 +297,12 @@ def _take_steps(
                     metrics.write(state.step, {**means, "cpu_seconds_per_step": spent})
                     progress.show(_progress_fields(means))
                 pending, clock, since = [], time.process_time(), state.step
-            if saves and metrics is not None:
-                left = [{k: float(v) for k, v in row.items()} for row in pending]
-                save_state(manager, Snapshot(state, metrics.rows, left), run.identity)
             if saves or measures:
+                processes.exchange(b"")  # waits for an evaluation, longer than Orbax and Gloo would
+            if saves:
+                left = [{k: float(v) for k, v in row.items()} for row in pending]
+                rows = [] if metrics is None else metrics.rows
+                save_state(manager, Snapshot(state, rows, left), run.identity)
                 # The others wait here, where a request to stop cannot end them before all is saved.
                 processes.exchange(b"")
             if number and not done:

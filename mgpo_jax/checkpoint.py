@@ -1,8 +1,9 @@
 """Training checkpoints (Orbax): everything that a run needs to resume as if it had never stopped.
 
 A checkpoint holds its own hash and the identity of its run, so that a run is never resumed from a damaged
-checkpoint, or from that of another run. Processes that train together have the same state. Process 0 writes
-and reads it and sends it to the others, so that a run can be resumed with another number of processes.
+checkpoint, or from that of another run. Processes that train together have the same state. All of them save
+it together, and process 0 reads it and sends it to the others, so that a run can be resumed with another
+number of processes.
 """
 
 from __future__ import annotations
@@ -43,7 +44,12 @@ class Snapshot(NamedTuple):
 
 @contextmanager
 def checkpoints(folder: Path, keep: int = 2) -> Iterator[ocp.CheckpointManager]:
-    """An Orbax checkpoint manager for this process alone, which saves synchronously.
+    """An Orbax checkpoint manager, which saves synchronously.
+
+    If several processes work together, each of them must open one and call ``save_state`` for the same
+    steps. Orbax then lets process 0 write what all of them have, and lets none go on before the checkpoint
+    is complete. It uses the barriers of ``jax.distributed``, which involve no devices. The folder of the
+    other processes may be that of process 0, or there may be none.
 
     A checkpoint becomes visible only when it is complete: a process that is killed while it saves leaves
     the earlier checkpoints intact.
@@ -56,16 +62,13 @@ def checkpoints(folder: Path, keep: int = 2) -> Iterator[ocp.CheckpointManager]:
         raise DataError(
             f"{folder} is not a folder; remove it to start the training from its first step"
         )
-    folder.mkdir(parents=True, exist_ok=True)
-    # The number by which Orbax knows this process, also where it works apart from the others.
-    own = jax.process_index()
+    if processes.is_first():
+        folder.mkdir(parents=True, exist_ok=True)
     options = ocp.CheckpointManagerOptions(
         max_to_keep=keep,
         create=False,
         enable_async_checkpointing=False,
-        multiprocessing_options=ocp.options.MultiprocessingOptions(
-            primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
-        ),
+        multiprocessing_options=_who_saves(),
     )
     with _quiet("absl", "asyncio"):
         manager = ocp.CheckpointManager(folder, options=options)
@@ -73,6 +76,24 @@ def checkpoints(folder: Path, keep: int = 2) -> Iterator[ocp.CheckpointManager]:
             yield manager
         finally:
             manager.close()
+
+
+def _who_saves() -> ocp.options.MultiprocessingOptions:
+    """The processes that save together, by the numbers that jax gives them.
+
+    They are named one by one even if they are all of them, since Orbax would otherwise wait for them by a
+    collective over all of their devices.
+    """
+    own = jax.process_index()
+    if processes.count() == 1:  # also if it works apart from others
+        return ocp.options.MultiprocessingOptions(
+            primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
+        )
+    return ocp.options.MultiprocessingOptions(
+        primary_host=0,
+        active_processes=set(range(jax.process_count())),
+        barrier_sync_key_prefix="together",
+    )
 
 
 @contextmanager
@@ -90,7 +111,22 @@ def _quiet(*names: str) -> Iterator[None]:
 
 
 def save_state(manager: ocp.CheckpointManager, snapshot: Snapshot, identity: str = "") -> None:
-    """Save a snapshot under its step. ``identity`` identifies the run (64 hexadecimal digits)."""
+    """Save a snapshot under its step, in all processes that work together.
+
+    Args:
+      manager: the checkpoint manager, as each process has opened it.
+      snapshot: the state, which all processes have, and the metrics, which only those of process 0 need.
+      identity: identifies the run (64 hexadecimal digits).
+
+    Raises:
+      DataError: if this process sees checkpoints of the same or later steps in a folder of its own.
+    """
+    step, newest = snapshot.state.step, manager.latest_step()
+    if newest is not None and newest >= step:
+        raise DataError(
+            f"{manager.directory} already has a checkpoint of step {newest}, so that none can be saved for "
+            f"step {step}; remove the folder, unless it is the one that process 0 has resumed from"
+        )
     rows = {"measured": snapshot.measured, "pending": snapshot.pending}
     saved = {
         **_named_leaves(snapshot.state),
@@ -98,7 +134,7 @@ def save_state(manager: ocp.CheckpointManager, snapshot: Snapshot, identity: str
         _IDENTITY: np.frombuffer(bytes.fromhex(identity or "00"), np.uint8),
     }
     saved[_HASH] = np.frombuffer(bytes.fromhex(hash_arrays(saved)), np.uint8)
-    manager.save(snapshot.state.step, args=ocp.args.StandardSave(saved))
+    manager.save(step, args=ocp.args.StandardSave(saved))
 
 
 def _named_leaves(state: TrainState) -> dict[str, np.ndarray]:
@@ -110,7 +146,7 @@ def _named_leaves(state: TrainState) -> dict[str, np.ndarray]:
 def restore_state(
     manager: ocp.CheckpointManager, blank: TrainState, identity: str | Collection[str] = ""
 ) -> Snapshot | None:
-    """The newest intact checkpoint, or None if there is none.
+    """The newest intact checkpoint, or None if there is none. Of several processes only one may call this.
 
     Damaged checkpoints are moved aside, and a line on stderr says so.
 

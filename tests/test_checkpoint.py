@@ -87,6 +87,14 @@ def test_a_process_that_works_apart_saves_under_its_own_number(
     assert (tmp_path / "3").is_dir()
 
 
+def test_a_later_checkpoint_in_the_way_is_named(tmp_path: Path, params: dict) -> None:
+    """A host may have one of another run. Orbax would save nothing there, while the others wait."""
+    with checkpoints(tmp_path) as manager:
+        save_state(manager, snapshot(params, 7))
+        with pytest.raises(DataError, match=r"already has a checkpoint of step 7.*for step 3"):
+            save_state(manager, snapshot(params, 3))
+
+
 def test_checkpoint_of_another_run(tmp_path: Path, params: dict) -> None:
     blank = train_state(params, 0)
     with checkpoints(tmp_path) as manager:

@@ -1,4 +1,4 @@
-"""``--distributed`` with two real processes on this machine: results, signals, crashes, disagreements.
+"""``--distributed`` with real processes on this machine: results, signals, crashes, disagreements.
 
 Networks and data are tiny; nearly all of the time goes into starting and compiling.
 """
@@ -18,17 +18,20 @@ from contextlib import suppress
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from own_world import WORLD
 from test_own_training import make_data
 
 from mgpo_jax import save_dataset
+from mgpo_jax.checkpoint import checkpoints, restore_state
 from mgpo_jax.encoders import LINEAR  # noqa: F401 (its module is needed before a network is made)
 from mgpo_jax.losses import initial_params
 from mgpo_jax.network_configs import network_config
 from mgpo_jax.policy_files import save_policy
 from mgpo_jax.settings import RECIPE_NETWORK
+from mgpo_jax.training import TrainState
 
 ROOT = Path(__file__).parents[1]
 LIMIT = 120  # seconds, after which a process is killed
@@ -116,6 +119,20 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield root
 
 
+def scripts(script: str, count: int, *words: str, devices: int = 1) -> list[subprocess.Popen[str]]:
+    """Processes that run a script with the place where they meet, their number, and other words."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        place = f"127.0.0.1:{free.getsockname()[1]}"
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": xla_flags(devices)}
+    return [
+        subprocess.Popen(
+            [sys.executable, "-c", script, place, str(number), *words],
+            cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )
+        for number in range(count)
+    ]  # fmt: skip
+
+
 ALONE = """
 import sys
 from experiments import joining
@@ -145,6 +162,100 @@ def test_a_process_whose_others_never_come_says_so() -> None:
             f"error: not all processes have met at {where} within 1 s; start all of them with the same "
             "--coordinator and --processes, and a --process each\n"
         )
+
+
+THREE = """
+import sys
+from pathlib import Path
+import jax, jax.numpy as jnp
+from jax.experimental import multihost_utils
+from experiments import joining
+from mgpo_jax import processes
+from mgpo_jax.checkpoint import Snapshot, checkpoints, save_state
+from mgpo_jax.sharding import fetch, mesh_of_all, split
+from mgpo_jax.training import TrainState
+
+index, place = int(sys.argv[2]), Path(sys.argv[3])
+flags = {"coordinator": sys.argv[1], "processes": 3, "process": index}
+joining.join(joining.Joined(distributed=True, **flags))
+multihost_utils.sync_global_devices = None  # a collective over all devices of all processes
+
+def save(folder, steps):
+    with checkpoints(folder) as manager:
+        for step in steps:
+            state = TrainState({"a": jnp.full(5, step, jnp.float32)}, (), step)
+            save_state(manager, Snapshot(state, [{"step": step, "from": index}], []))
+
+save(place / ("none" if index == 2 else "shared"), (3, 6, 9))
+with processes.apart():
+    save(place / f"own{index}", (1,))
+assert processes.from_first(lambda: index) == 0
+assert processes.total(index) == 3
+assert fetch(split(mesh_of_all(), jnp.arange(12))).tolist() == list(range(12))
+processes.team().leave(wait=True)
+"""
+
+
+def test_three_processes_save_together(tmp_path: Path) -> None:
+    """Each has two devices, and one sees another folder; any number of processes can go on."""
+    started = scripts(THREE, 3, str(tmp_path), devices=2)
+    for process in started:
+        out, err = process.communicate(timeout=LIMIT)
+        assert (process.returncode, out) == (0, ""), err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["own0", "own1", "own2", "shared"]
+    blank = TrainState({"a": jnp.zeros(5)}, (), 0)
+    with checkpoints(tmp_path / "shared") as manager:
+        found = restore_state(manager, blank)
+        assert sorted(manager.all_steps()) == [6, 9]
+    assert found is not None
+    assert found.state.params["a"].tolist() == [9] * 5
+    assert (found.state.step, found.measured) == (9, [{"step": 9, "from": 0}])
+
+
+RAISING = """
+import socket, sys, time
+from envs.errors import DataError
+from experiments import joining, runtime
+from mgpo_jax import processes
+
+place, number, raising = sys.argv.pop(1), int(sys.argv.pop(1)), int(sys.argv.pop(1))
+doors = []
+
+class Door(processes.Door):
+    def __init__(self, *args):
+        super().__init__(*args)
+        doors.append(self.port)
+
+processes.Door = Door
+
+def main(config):
+    joining.join(joining.Joined(distributed=True, coordinator=place, processes=2, process=number))
+    for port in doors:
+        try:
+            socket.create_connection(("127.0.0.1", port), timeout=5)
+        except ConnectionRefusedError:
+            print("closed", flush=True)
+    if number == raising:
+        raise DataError("no room is left; make some")
+    time.sleep(60)
+
+runtime.run(joining.Joined, main)
+"""
+
+
+@pytest.mark.parametrize("raising", [0, 1])
+def test_a_process_that_fails_ends_the_other(raising: int) -> None:
+    """Both say why, each in one line; and nobody can connect to process 0 any more."""
+    since = time.monotonic()
+    started = scripts(RAISING, 2, str(raising))
+    said = [process.communicate(timeout=LIMIT) for process in started]
+    assert time.monotonic() - since < 50
+    assert [process.returncode for process in started] == [1, 1], said
+    assert [out for out, _ in said] == ["closed\n", ""]
+    own = "error: no room is left; make some"
+    news = f"error: process {raising} on {socket.gethostname()} failed: no room is left; make some"
+    wanted = [own if number == raising else news for number in (0, 1)]
+    assert [err.splitlines()[-1] for _, err in said] == wanted
 
 
 def both(words: str, place: Path) -> list[tuple[int, str, str]]:
@@ -274,14 +385,66 @@ def test_processes_with_other_data_do_not_begin(place: Path, trained: Path, tmp_
     assert not (place / "never").exists()
 
 
-def test_an_adaptation_has_the_bits_of_one_process(place: Path) -> None:
+@pytest.fixture(scope="module")
+def adapted(place: Path) -> Path:
+    """An adaptation of one process with two devices."""
+    alone(f"{ADAPT} --out one", place, devices=2)
+    return place / "one"
+
+
+def test_an_evaluation_has_the_bits_of_one_process(place: Path, adapted: Path) -> None:
+    words = "evaluate one --episodes 2 --action-noise 0 0.2"
+    (code, out, err), second = both(f"{words} --json both.json", place)
+    assert code == 0, err
+    assert "0.2" in out
+    assert second == (0, "", "")
+    alone(f"{words} --json alone.json", place, devices=2)
+    rows = [json.loads((place / name).read_text())["rows"] for name in ("both.json", "alone.json")]
+    assert len(rows[0]) == 2
+    assert rows[0] == rows[1]
+
+
+REPRODUCING = """
+import sys
+from experiments import comparisons, reproduce
+
+comparisons.SMOKE_TASKS = comparisons.SMOKE_EPISODES = 2
+made, adapt_and_save = [], comparisons.adapt_and_save
+
+def adapt(folder, *args):
+    print("makes", folder.name, file=sys.__stderr__)
+    adapt_and_save(folder, *args)
+
+comparisons.adapt_and_save = adapt
+place, number = sys.argv[1:3]
+reproduce.command([
+    "table1", "--env", "maze15", "--scale", "smoke", "--only", "gcbc", "ucb", "--out", sys.argv[3],
+    "--distributed", "--coordinator", place, "--processes", "2", "--process", number,
+])
+"""
+
+
+@pytest.mark.slow
+def test_a_table_is_made_by_two_processes(tmp_path: Path, place: Path) -> None:
+    """Each adapts with one of the methods, and process 0 prints the table."""
+    started = scripts(REPRODUCING, 2, str(tmp_path))
+    (out, first), (nothing, second) = [process.communicate(timeout=300) for process in started]
+    assert [process.returncode for process in started] == [0, 0], first + second
+    assert [line for line in first.splitlines() if line.startswith("makes")] == [
+        "makes gcbc-smoke-1seeds"
+    ]
+    assert (nothing, second) == ("", "makes ucb-smoke-1seeds\n")
+    rows = [line.split("|")[2].strip() for line in out.splitlines() if line.startswith("| maze15")]
+    assert rows == ["GC-BC", "MGPO-UCB"]
+
+
+def test_an_adaptation_has_the_bits_of_one_process(place: Path, adapted: Path) -> None:
     """Even if only process 0 wants to divide segments into parts of one round."""
     words = ADAPT.replace("own_world", "short_parts")
     (code, out, err), second = both(f"{words} --out two", place)
     assert code == 0, err
     assert "explore" in out
     assert second == (0, "", "")
-    alone(f"{ADAPT} --out one", place, devices=2)
     for name in ("results.npz", "tasks.npz"):
         with np.load(place / "one" / name) as one, np.load(place / "two" / name) as two:
             assert sorted(one) == sorted(two)
