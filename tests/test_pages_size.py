@@ -150,9 +150,9 @@ def test_a_small_picture_is_kept_behind_a_large_one() -> None:
 
 def test_a_page_that_cannot_draw_a_world_says_how_to_get_pictures(tmp_path: Path) -> None:
     folder = saved(tmp_path / "filmed", made_results(config=config_of("filmed")))
-    (note,) = data_of(report([folder]))["notes"]
-    assert f"python -m experiments.plot {folder} --tasks 0 --out figures" in note
-    assert f"python -m experiments.report {folder} --pictures figures/*.gif" in note
+    notes = data_of(report([folder]))["notes"]
+    assert f"python -m experiments.plot {folder} --tasks 0 --out figures" in notes
+    assert f"python -m experiments.report {folder} --pictures figures/*.gif" in notes
     shutil.copy(ROOT / "docs/playground.png", folder.parent / "a.png")
     assert data_of(report([folder], [folder.parent / "a.png"]))["notes"] == []
 

@@ -217,7 +217,8 @@ export const world = {
     ["target", "filled disc: switched on"],
     ["ink", "small number: position in the true order"],
     ["prompt", "number above: position in the prompt"],
-    ["agent", "ring and line: agent and its path; number below: when it switched the object, on or off"],
+    ["agent", "ring and line: agent and its path"],
+    ["agent", "number below: when it was switched, on or off"],
   ],
   spots: ({ side }) => [side, side],
   tellSpot(facts, task, spot) {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -180,14 +181,18 @@ def _with_arrays(
 
 
 def _how_to_draw(first: Results) -> list[str]:
-    """How to get pictures of a world whose episodes the page cannot draw, if there are any."""
+    """How to get pictures of a world whose episodes the page cannot draw, if there are any.
+
+    The page shows a note that begins with ``python`` as a command.
+    """
     if page_of(first.world).script is not None or first.world.pictures is None:
         return []
-    folder = first.folder or Path()
+    folder = shlex.quote(str(first.folder))
     return [
-        "This page cannot draw the episodes of this world. Pictures and videos of it are made by "
-        f"python -m experiments.plot {folder} --tasks 0 --out figures, and are shown in this page if it is "
-        f"made by python -m experiments.report {folder} --pictures figures/*.gif"
+        "This page cannot draw the episodes of this world. Pictures and videos of them are made by",
+        f"python -m experiments.plot {folder} --tasks 0 --out figures",
+        "and are shown at the end of the page that is made by",
+        f"python -m experiments.report {folder} --pictures figures/*.gif",
     ]
 
 

@@ -93,7 +93,7 @@ class Report {
     document.title = `${data.world.name}: ${logs.map((log) => log.data.label).join(", ")}`;
     byId("title").textContent = `Adaptation to ${data.tasks.length} tasks of ${data.world.name}`;
     byId("summary").textContent = data.world.summary;
-    fill(byId("notes"), ...data.notes.map((note) => element("p", { class: "quiet" }, note)));
+    fill(byId("notes"), ...data.notes.map((note) => element(note.startsWith("python ") ? "pre" : "p", { class: "quiet" }, note)));
     fill(byId("head"), factsTable(logs));
     fill(byId("comparisons"), ...logs.slice(1).map((log) =>
       element("p", {}, `${log.data.label} minus ${logs[0].data.label}, paired by task, with 95 % intervals over seeds: ${log.data.comparison}.`)));
