@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import cache
-from math import ceil
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,12 +23,16 @@ from experiments.comparisons import (
 )
 from experiments.store import runs
 from experiments.store.adapt_settings import AdaptConfig
-from experiments.store.layout import META
 from experiments.store.metrics import METRICS, cpu_seconds_of_training, read_metrics
-from experiments.store.provenance import read_meta
 from experiments.store.reproduce_settings import ABLATIONS, COMPARISONS, GLANCE, ReproduceConfig
 from experiments.store.settings import DEFAULT_WORLD, PretrainConfig, file_name
-from experiments.store.summary import ADAPT_AGAIN, read_summary
+from experiments.store.speeds import (
+    cpu_seconds_of,
+    num_episodes,
+    rate_of,
+    rates_in,
+    shipped_rates,
+)
 from experiments.store.tables import table
 from mgpo_jax import methods
 from mgpo_jax.methods import Method
@@ -203,44 +205,14 @@ def _estimate(config: ReproduceConfig, settings: AdaptConfig) -> float | None:
     """CPU-seconds of an adaptation at the speed of similar published ones; None if there are none."""
     world = envs.find(settings.env)
     rate = seconds_per_episode(settings.env, methods.find(settings.method))
-    judgements = 1 + ceil(settings.episodes / settings.eval_every)
-    episodes = settings.episodes + judgements * world.judged.episodes
-    lanes = settings.seeds * _num_tasks(config, settings.env)
-    return None if rate is None else rate * episodes * lanes
+    episodes = num_episodes(settings, world, _num_tasks(config, settings.env))
+    return None if rate is None else rate * episodes
 
 
 def seconds_per_episode(world: str, method: Method) -> float | None:
     """CPU-seconds per episode in the published adaptations in a world; None if none are similar.
 
-    This is the rate of the same method, or else the mean over methods that learn in the same way. A method
-    that learns nothing costs at most as much as the cheapest of all.
+    Outside of a clone, where there are no published results, the rates are those in the package.
     """
-    rates = _rates_in((PUBLISHED / file_name(world)).absolute())
-    if method.name in rates:
-        return rates[method.name]
-    if not method.learns:
-        return min(rates.values(), default=None)
-    alike = [rate for name, rate in rates.items() if way_of(methods.find(name)) == way_of(method)]
-    return sum(alike) / len(alike) if alike else None
-
-
-def way_of(method: Method) -> tuple[str, type]:
-    """How a method learns: the kind of its network, and the base class of its hyper-parameters."""
-    return method.policy, method.hyper.__mro__[-2]  # the last class is object
-
-
-@cache
-def _rates_in(folder: Path) -> Mapping[str, float]:
-    """CPU-seconds per episode of the adaptations in a folder that ran on CPUs, by method."""
-    folders = {name: folder / file_name(name) for name in methods.names()}
-    return {
-        name: 1 / read_summary(path)["episodes_per_cpu_second"]
-        for name, path in folders.items()
-        if path.is_dir() and cpu_seconds_of(path) is not None
-    }
-
-
-def cpu_seconds_of(folder: Path) -> float | None:
-    """CPU-seconds of an adaptation; None if it ran on accelerators, which do most of its work."""
-    meta = read_meta(folder / META, ADAPT_AGAIN)
-    return read_summary(folder)["cpu_seconds"] if meta.on_cpus else None
+    folder = (PUBLISHED / file_name(world)).absolute()
+    return rate_of(rates_in(folder) if folder.is_dir() else shipped_rates(world), method)

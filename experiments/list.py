@@ -11,6 +11,7 @@ from envs.errors import UsageError
 from envs.registry import WORLDS, Registry, World
 from experiments.installed import extras, released_networks
 from experiments.runtime import Common, run, say
+from experiments.store.speeds import shipped_rates, usual_cost
 from mgpo_jax.kinds import KINDS, MULTI_GOAL
 from mgpo_jax.methods import METHODS, Method
 
@@ -27,7 +28,7 @@ def needs_of(record: Any) -> str:
     """What a world, method or network needs beyond this package, in one line; may be empty."""
     if isinstance(record, World):
         networks = ", ".join(map(str, released_networks(record))) or "none"
-        return f"released networks: {networks}{_extra_of(record)}"
+        return f"released networks: {networks}{_extra_of(record)}{_cost_of(record)}"
     if isinstance(record, Method) and record.policy != MULTI_GOAL:
         return f"starts from the network {record.policy}"
     return ""
@@ -40,6 +41,15 @@ def _extra_of(world: World) -> str:
     return f"; {missing[0]}" if missing else f"; extra {world.extra}"
 
 
+def _cost_of(world: World) -> str:
+    """What the default adaptation costs in a world, such as ``; adapt takes about 31 CPU-seconds``."""
+    seconds = usual_cost(world)
+    if seconds is None:
+        return ""
+    time = f"{seconds:.0f} CPU-seconds" if seconds < 120 else f"{seconds / 60:.0f} CPU-minutes"
+    return f"; adapt takes about {time}"
+
+
 def gathered() -> dict[str, Any]:
     """All worlds, methods and networks, and what each needs, as JSON values."""
     return {
@@ -50,6 +60,8 @@ def gathered() -> dict[str, Any]:
                 "extra": world.extra,
                 "networks": {kind: size for kind, size in released_networks(world)},
                 "test_tasks": world.num_test_tasks,
+                "cpu_seconds_per_episode": dict(shipped_rates(world.name)),
+                "cpu_seconds_of_adapt": usual_cost(world),
             }
             for world in WORLDS.usable()
         ],

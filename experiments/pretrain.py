@@ -6,6 +6,7 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
+from envs.errors import UsageError
 from experiments.joining import check_flags, join
 from experiments.runtime import run, say
 from experiments.store.presets import check_pretraining, pretrain_default
@@ -19,6 +20,10 @@ def main(config: PretrainConfig) -> None:
     """Pre-train the multi-goal Transformer on hindsight prompts."""
     check_flags(config)
     check_pretraining(config)
+    if config.json and not config.dry_run:
+        raise UsageError(
+            "--json prints the estimate of --dry-run as JSON; add --dry-run, or leave it out"
+        )
     if not config.dry_run:
         check_start(config)
         join(config)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 
+from envs.errors import UsageError
 from experiments import adapt, pretrain
 from experiments.parsing import parse
 from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.presets import pretrain_default
 from experiments.store.settings import PretrainConfig
+from experiments.store.speeds import SPEEDS, measured, shipped_rates
 
 ROOT = Path(__file__).parents[1]
 
@@ -35,9 +38,36 @@ def test_what_was_never_measured_is_not_known(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    adapt.main(parse(AdaptConfig, ["--dry-run"], adapt.adapt_default))
+    words = ["--env", "envs.maze:MAZE15", "--dry-run"]  # its place is no name that was measured
+    adapt.main(parse(AdaptConfig, words, adapt.adapt_default))
     assert "unknown: no similar run" in capsys.readouterr().out
+    adapt.main(parse(AdaptConfig, [*words, "--json"], adapt.adapt_default))
+    assert json.loads(capsys.readouterr().out)["cpu_seconds"] is None
     assert not list(tmp_path.iterdir())
+
+
+def test_the_speed_is_known_without_published_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Only a clone has them; an installed package has the rates in a file."""
+    monkeypatch.chdir(tmp_path)
+    adapt.main(parse(AdaptConfig, ["--dry-run", "--json"], adapt.adapt_default))
+    found = json.loads(capsys.readouterr().out)
+    assert found["searches"] == 150
+    assert found["cpu_seconds"] == pytest.approx(
+        sum(found["episodes"].values()) * shipped_rates("maze15")["ucb"]
+    )
+
+
+def test_the_speeds_in_the_package_are_those_of_the_published_results() -> None:
+    assert json.loads(SPEEDS.read_text()) == measured(ROOT / "results")
+
+
+def test_json_is_for_estimates(tmp_path: Path) -> None:
+    words = ["--json", "--out", str(tmp_path / "new")]
+    with pytest.raises(UsageError, match="--json prints the estimate of --dry-run"):
+        pretrain.main(parse(PretrainConfig, words, pretrain_default))
+    assert not (tmp_path / "new").exists()
 
 
 def test_a_training_that_goes_on_from_a_policy_tells_its_schedule(
@@ -63,6 +93,16 @@ def test_a_training_is_only_counted(
     assert found["trajectories"] == "100,000, 200 of them held out"
     assert found["network"] == "606,853 weights"  # as the released policy has
     assert found["tokens"] == f"at most {5 + 2 * 64 - 1:,} a trajectory"
+    assert found["observations"] == "float32[6]"
+    assert found["goals"] == "2 numbers"
+    assert found["actions"] == "5 discrete"
+    assert found["batches"] == "64 trajectories in parts of 16, at most 147 kB of input"
     assert "time" in found["CPU"]
     assert "about " in found["CPU"]
+    pretrain.main(
+        parse(PretrainConfig, ["--steps", "4000", "--dry-run", "--json"], pretrain_default)
+    )
+    again = json.loads(capsys.readouterr().out)
+    assert (again["weights"], again["steps"]) == (606_853, 4_000)
+    assert again["batches"]["bytes"] == 64 * 64 * 4 * (6 + 1 + 2)
     assert not list(tmp_path.iterdir())

@@ -83,6 +83,9 @@ def test_what_is_there_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     found = json.loads(capsys.readouterr().out)
     worlds = {world["name"]: world for world in found["worlds"]}
     assert worlds["kitchen-stock"]["networks"] == worlds["kitchen"]["networks"]
+    assert worlds["maze15"]["cpu_seconds_per_episode"]["ucb"] < 0.01
+    assert 5 < worlds["maze15"]["cpu_seconds_of_adapt"] < 100
+    assert worlds["kitchen-native"]["cpu_seconds_of_adapt"] is None
     assert {method["name"]: method["network"] for method in found["methods"]}["ptgm"] == "ptgm"
     info.main(InfoConfig(json=True))
     found = json.loads(capsys.readouterr().out)
@@ -96,6 +99,7 @@ def test_what_is_there_as_text(capsys: pytest.CaptureFixture[str]) -> None:
     text = capsys.readouterr().out
     assert "released networks: mgpo 2.5 MB, ptgm 2.5 MB" in text
     assert "starts from the network spirl" in text
+    assert "spirl 1.4 MB; adapt takes about " in text
     info.main(InfoConfig())
     text = capsys.readouterr().out
     assert "extra " in text

@@ -413,7 +413,7 @@ def test_a_gpu_says_nothing_about_cpu_time(tmp_path: Path, monkeypatch: pytest.M
     assert rate("maze15", ucb) is not None
     meta = tmp_path / "maze15" / "ucb" / "meta.json"
     meta.write_text(json.dumps({**json.loads(meta.read_text()), "devices": ["cuda:0"]}))
-    inventory._rates_in.cache_clear()
+    inventory.rates_in.cache_clear()
     assert rate("maze15", ucb) is None
     assert inventory.cpu_seconds_of(tmp_path / "maze15" / "ucb") is None
 

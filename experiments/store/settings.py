@@ -142,6 +142,8 @@ class PretrainConfig(Joined):
     """Continue an interrupted run from its latest checkpoint, bit for bit."""
     dry_run: bool = False
     """Print what would be done and roughly how much CPU time it would take, then exit."""
+    json: bool = False
+    """Print this estimate as JSON; only with ``--dry-run``."""
     tb: bool = False
     """Also log metrics to TensorBoard (extra: tb)."""
     wandb: bool = False
@@ -163,7 +165,7 @@ def file_name(name: str) -> str:
 
 NO_SETTINGS = frozenset(
     {
-        "preset", "init", "out", "resume", "debug", "quiet", "config", "dry_run", "tb", "wandb",
+        "preset", "init", "out", "resume", "debug", "quiet", "config", "dry_run", "json", "tb", "wandb",
         "eval_every", "save_every", "data_folder", *OF_PROCESSES,
     }
 )  # fmt: skip
