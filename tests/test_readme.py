@@ -18,6 +18,20 @@ def test_python_blocks_run() -> None:
         exec(compile(block, str(README), "exec"), {})
 
 
+def test_the_versions_of_jax_are_those_that_were_tried() -> None:
+    """CONTRIBUTING.md has what ``.ci/versions`` found last."""
+    tried = re.findall(
+        r"[Ww]ith jax (\d+\.\d+\.\d+)", (README.parent / "CONTRIBUTING.md").read_text()
+    )
+    assert len(tried) == 2
+    install = " ".join((README.parent / "docs/install.md").read_text().split())
+    assert "versions that were tried are {} and {} (on".format(*tried) in " ".join(
+        README.read_text().split()
+    )
+    for version in tried:
+        assert f"jax {version}," in install
+
+
 def test_every_linked_file_exists() -> None:
     links = re.findall(r"\]\(([^)#]+)\)|src=\"([^\"]+)\"", README.read_text())
     for link in {a or b for a, b in links}:
