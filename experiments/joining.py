@@ -24,7 +24,7 @@ from annotated_types import Ge, Le
 from envs.errors import DataError, UsageError, printable, shown
 from experiments import cards, signals
 from experiments.runtime import Common, Silent
-from mgpo_jax import processes
+from mgpo_jax import doors, processes
 from mgpo_jax.claims import clean_up
 from mgpo_jax.processes import Member
 from mgpo_jax.settings import flag
@@ -186,7 +186,7 @@ def _connect(config: Joined) -> processes.Team:
 
     first = jax.process_index() == 0
     only_here = (config.coordinator or "").startswith(("127.", "localhost:"))
-    door = processes.Door(only_here) if first else None
+    door = doors.Door(only_here) if first else None
     host, pid = processes.own_name()
     password, port = (door.password, door.port) if door else (b"", 0)
     own = np.frombuffer(PLACE.pack(host.encode()[:64], pid, port, password), np.uint8)
@@ -202,7 +202,7 @@ def _connect(config: Joined) -> processes.Team:
     else:
         _, _, port, password = told[0]
         places = [*_host_of_first(), members[0].host]
-        links = {0: processes.connected(places, port, password, jax.process_index())}
+        links = {0: doors.connected(places, port, password, jax.process_index())}
     told_to_resume = GO_ON["resume" if hasattr(config, "resume") else ""]
     return processes.Team(
         members,

@@ -21,7 +21,6 @@ import io
 import json
 import os
 import queue
-import secrets
 import socket
 import struct
 import threading
@@ -36,13 +35,7 @@ from envs.errors import DataError, shown
 
 Value = TypeVar("Value")
 
-MEETING = 60.0  # seconds in which all processes must have connected
-GREETING = 5.0  # seconds in which a process that has connected must say the password
-# TCP keepalive: after ``SILENT`` seconds without traffic, ``PROBES`` probes are sent, ``BETWEEN`` seconds
-# apart; a host that answers none of them counts as gone.
-SILENT, PROBES, BETWEEN = 10, 3, 5
 SAME = "start all processes with the same settings, programs and data"
-NETWORK = "check that the network and firewalls allow the connection"
 
 _HEAD = struct.Struct(">cIQ")  # kind of message, index of the sender, number of bytes that follow
 _PIECE, _DONE, _SIGNAL, _FAILED, _GONE = b"p", b"d", b"s", b"f", b"g"
@@ -156,9 +149,9 @@ class Team:
     def _read(self, number: int) -> None:
         """Receive from one process until its connection ends."""
         with suppress(OSError):
-            while head := _received(self._links[number], _HEAD.size):
+            while head := received(self._links[number], _HEAD.size):
                 kind, source, size = _HEAD.unpack(head)
-                text = _received(self._links[number], size)
+                text = received(self._links[number], size)
                 if kind == _DONE:
                     self._done.add(number)
                 if kind in (_PIECE, _DONE):
@@ -176,7 +169,7 @@ class Team:
         self._heard(_EVENTS[kind], self.members[source], text.decode(errors="replace"))
 
 
-def _received(link: socket.socket, size: int) -> bytes:
+def received(link: socket.socket, size: int) -> bytes:
     """Receive ``size`` bytes; returns none if the connection ends first."""
     pieces = bytearray()
     while len(pieces) < size:
@@ -197,98 +190,6 @@ def _unpacked(text: bytes) -> Iterator[bytes]:
         (size,) = struct.unpack_from(">Q", text, place)
         yield text[place + 8 : place + 8 + size]
         place += 8 + size
-
-
-class Door:
-    """The listening socket on which process 0 waits for the others, who must know the password.
-
-    Args:
-      only_here: whether all processes run on this host, so that no other host may connect.
-    """
-
-    def __init__(self, only_here: bool) -> None:
-        self._listening = socket.create_server(("127.0.0.1", 0)) if only_here else _open_to_all()
-        self.password = secrets.token_bytes(16)
-        self.port = self._listening.getsockname()[1]
-
-    def let_in(self, members: Sequence[Member]) -> dict[int, socket.socket]:
-        """Accept the connections of all other processes, and then close the socket.
-
-        Returns:
-          The connections by the index of the process.
-
-        Raises:
-          DataError: if a process does not connect in time.
-        """
-        links: dict[int, socket.socket] = {}
-        end = time.monotonic() + MEETING
-        with self._listening:
-            while len(links) < len(members) - 1:
-                self._listening.settimeout(max(end - time.monotonic(), 0.01))
-                try:
-                    link, _ = self._listening.accept()
-                except OSError:
-                    missing = next(one for one in members[1:] if one.number not in links)
-                    raise DataError(
-                        f"{missing} has not connected to process 0 on {members[0].host} within "
-                        f"{MEETING:.0f} s; {NETWORK}"
-                    ) from None
-                if (number := self._greeted(link)) is None:
-                    link.close()
-                else:
-                    links[number] = _with_keepalive(link)
-        return links
-
-    def _greeted(self, link: socket.socket) -> int | None:
-        """The index of the process at the other end; None for a stranger, who may say nothing at all."""
-        said = b""
-        with suppress(OSError):
-            link.settimeout(GREETING)
-            said = _received(link, len(self.password) + 4)
-        known = secrets.compare_digest(said[:-4], self.password)
-        return struct.unpack(">I", said[-4:])[0] if known else None
-
-
-def _open_to_all() -> socket.socket:
-    """A listening socket on all addresses of this host, those of IPv6 too where the system has them."""
-    if socket.has_dualstack_ipv6():
-        with suppress(OSError):
-            return socket.create_server(("", 0), family=socket.AF_INET6, dualstack_ipv6=True)
-    return socket.create_server(("", 0))
-
-
-def connected(places: Sequence[str], port: int, password: bytes, index: int) -> socket.socket:
-    """Connect to process 0 at the first of several host names that answers.
-
-    Raises:
-      DataError: if none answers.
-    """
-    fault = ""
-    for place in places:
-        try:
-            link = socket.create_connection((place, port), timeout=MEETING)
-            link.sendall(password + struct.pack(">I", index))
-            return _with_keepalive(link)
-        except OSError as error:
-            fault = f"{place}:{port}: {error}"
-    raise DataError(f"process 0 cannot be reached at {fault}; {NETWORK}")
-
-
-def _with_keepalive(link: socket.socket) -> socket.socket:
-    """Enable keepalive on a connection, so that it ends soon after the host at its other end is gone."""
-    link.settimeout(None)
-    link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    link.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    milliseconds = 1000 * (SILENT + PROBES * BETWEEN)
-    for name, value in (
-        ("TCP_KEEPIDLE", SILENT),
-        ("TCP_KEEPINTVL", BETWEEN),
-        ("TCP_KEEPCNT", PROBES),
-        ("TCP_USER_TIMEOUT", milliseconds),
-    ):
-        if hasattr(socket, name):  # otherwise the system's default applies
-            link.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
-    return link
 
 
 class _Present:

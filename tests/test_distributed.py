@@ -216,21 +216,21 @@ RAISING = """
 import socket, sys, time
 from envs.errors import DataError
 from experiments import joining, runtime
-from mgpo_jax import processes
+from mgpo_jax import doors
 
 place, number, raising = sys.argv.pop(1), int(sys.argv.pop(1)), int(sys.argv.pop(1))
-doors = []
+ports = []
 
-class Door(processes.Door):
+class Door(doors.Door):
     def __init__(self, *args):
         super().__init__(*args)
-        doors.append(self.port)
+        ports.append(self.port)
 
-processes.Door = Door
+doors.Door = Door
 
 def main(config):
     joining.join(joining.Joined(distributed=True, coordinator=place, processes=2, process=number))
-    for port in doors:
+    for port in ports:
         try:
             socket.create_connection(("127.0.0.1", port), timeout=5)
         except ConnectionRefusedError:

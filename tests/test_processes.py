@@ -25,10 +25,11 @@ from envs.errors import UsageError
 from experiments import cards, joining, signals, training
 from experiments.datasets import _as_one
 from experiments.joining import Joined, check_flags
-from mgpo_jax import lanes, processes, programs, segments, sharding
+from mgpo_jax import doors, lanes, processes, programs, segments, sharding
 from mgpo_jax.checkpoint import Snapshot
+from mgpo_jax.doors import Door, connected
 from mgpo_jax.methods import UCB
-from mgpo_jax.processes import DisagreementError, Door, Member, Team, connected
+from mgpo_jax.processes import DisagreementError, Member, Team
 from mgpo_jax.runner import sweep
 from mgpo_jax.training import ASKED, Trainer, TrainState
 
@@ -159,7 +160,7 @@ def test_strangers_are_not_let_in() -> None:
 
 def test_a_stranger_that_says_nothing_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     """The others are let in all the same."""
-    monkeypatch.setattr(processes, "GREETING", 0.1)
+    monkeypatch.setattr(doors, "GREETING", 0.1)
     door = Door(only_here=True)
     silent = socket.create_connection(("127.0.0.1", door.port))
     own = connected(["127.0.0.1"], door.port, door.password, 1)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from itertools import islice
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -150,6 +154,27 @@ def test_the_gradient_does_not_depend_on_devices():
     _, found, found_metrics = gradient(NETWORK, 4, 2)
     assert_close(found, expected)
     assert_close(found_metrics, metrics)
+
+
+EIGHT = """
+from test_training import NETWORK, assert_close, gradient
+found = [gradient(NETWORK, 8, devices)[1:] for devices in (1, 2, 8)]
+for one in found[1:]:
+    assert_close(one, found[0])
+"""
+
+
+def test_the_gradient_does_not_depend_on_many_devices():
+    """In a process of its own, since jax counts its devices only once."""
+    root = Path(__file__).parents[1]
+    ways = os.pathsep.join([str(root), str(root / "tests"), os.environ.get("PYTHONPATH", "")])
+    flags = os.environ["XLA_FLAGS"].replace("device_count=2", "device_count=8")
+    done = subprocess.run(
+        [sys.executable, "-c", EIGHT],
+        env={**os.environ, "PYTHONPATH": ways, "XLA_FLAGS": flags},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
 
 
 def assert_close(found, expected):
