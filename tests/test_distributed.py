@@ -409,7 +409,7 @@ import sys
 from experiments import comparisons, reproduce
 
 comparisons.SMOKE_TASKS = comparisons.SMOKE_EPISODES = 2
-made, adapt_and_save = [], comparisons.adapt_and_save
+adapt_and_save = comparisons.adapt_and_save
 
 def adapt(folder, *args):
     print("makes", folder.name, file=sys.__stderr__)
