@@ -107,9 +107,8 @@ class Pool:
         self._lock = Lock()
         self._live: OrderedDict[bytes, Live] = OrderedDict()
         self._idle: list[Any] = [*self.spare]
-        self._made: list[
-            Any
-        ] = []  # vector environments close their parts when they are no longer referenced
+        # Vector environments close their parts when they are no longer referenced.
+        self._made: list[Any] = []
         self._memory: OrderedDict[bytes, tuple[bytes, Reading]] = OrderedDict()
         self._threads = ThreadPoolExecutor(self.num_threads) if self.num_threads > 1 else None
         self.num_made, self.num_replayed = len(self._idle), 0

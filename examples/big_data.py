@@ -46,8 +46,7 @@ def trajectory(rng: np.random.Generator) -> dict[str, np.ndarray]:
 def write(folder: Path, num: int) -> None:
     """Write a dataset of ``num`` trajectories to a new folder."""
     rng = np.random.default_rng(0)
-    with new_folder(folder) as place:
-        files = GrowingFiles(place)
+    with new_folder(folder) as place, GrowingFiles(place) as files:
         for _ in range(num):
             files.append(trajectory(rng))
         finish_mapped(place, files.finish(), num, num * STEPS, {"seed": 0})

@@ -31,7 +31,9 @@ def own_cards(environment: Mapping[str, str]) -> list[int] | None:
         return None  # the user has chosen, and jax reads this variable itself
     visible = environment.get("CUDA_VISIBLE_DEVICES")
     cards = [] if visible is None else list(filter(None, visible.split(",")))
-    if tasks_on_host(environment) == 1:
+    tasks = tasks_on_host(environment)
+    # With fewer cards than there are processes, these cards are this process's own.
+    if tasks == 1 or (tasks is not None and 0 < len(cards) < tasks):
         return list(range(len(cards)))
     return [0] if len(cards) == 1 else None
 

@@ -365,10 +365,10 @@ def collect_and_save(
         refuse_existing(folder, "remove it", "choose another folder with --out")
     if processes.is_first():
         check_place(folder, num_bytes=config.trajectories * SMALLEST_TRAJECTORY)
-    with long_work(folder, asked, provenance(), config.resume, wait, go_on) as work:
+    work_on = long_work(folder, asked, provenance(), config.resume, wait, go_on)
+    with work_on as work, GrowingFiles(work.place) as files:
         expect_compiling()
         cpu = time.process_time()
-        files = GrowingFiles(work.place)
         facts = collected(
             env,
             demonstrator,

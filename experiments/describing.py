@@ -58,6 +58,7 @@ def facts_of(folder: Path) -> dict[str, Any]:
         "goals": {"size": facts.goal_dim, "reached": float(np.mean(dataset.goal_reached))},
         "returns": None if returns is None else _spread(returns),
         "ends": ends,
+        "dropped_ends": manifest.get("dropped_ends"),
         "bytes": sum(array.nbytes for array in dataset.arrays.values()),
     }
 

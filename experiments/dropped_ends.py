@@ -12,7 +12,7 @@ from typing import Any
 
 from mgpo_jax.manifest import DroppedEnds, EndCount
 
-KINDS = ("terminated", "truncated", "neither")
+KINDS = ("terminated", "truncated", "both", "neither")
 
 
 class Tally:
@@ -49,13 +49,16 @@ def _counts(found: dict[int, list[int]]) -> list[EndCount]:
 
 def kind_of_end(terminated: bool, truncated: bool) -> str:
     """One of ``KINDS`` for the marks of an episode's last step."""
+    if terminated and truncated:
+        return "both"
     return "truncated" if truncated else "terminated" if terminated else "neither"
 
 
 def wrong_ends(ends: DroppedEnds, horizon: int) -> Iterator[tuple[str, str, str]]:
     """Find time limits that were logged as terminations, and the reverse.
 
-    The rules are those for ends that the dataset still has. They apply to the lengths in the logs; the
+    The rules are those for ends that the dataset still has, with one finding for each length instead of one
+    for each trajectory. They apply to the lengths in the logs; the
     horizon is that of the dataset, or the longest episode of the logs if that is longer.
 
     Args:
@@ -66,7 +69,7 @@ def wrong_ends(ends: DroppedEnds, horizon: int) -> Iterator[tuple[str, str, str]
       ``fault`` or ``note``, the kind of finding, and a sentence.
     """
     counts = {kind: list(getattr(ends, kind)) for kind in KINDS}
-    horizon = max(horizon, *(one.steps for found in counts.values() for one in found))
+    horizon = max([horizon, *(one.steps for found in counts.values() for one in found)])
     at = {kind: [one for one in found if one.steps == horizon] for kind, found in counts.items()}
     whole = sum(one.episodes for found in at.values() for one in found)
     for one in at["terminated"]:
@@ -79,7 +82,7 @@ def wrong_ends(ends: DroppedEnds, horizon: int) -> Iterator[tuple[str, str, str]
                 "truncation, or terminals and timeouts are swapped",
             )
     early = [one for one in counts["truncated"] if one.steps < horizon]
-    if early and at["truncated"]:
+    if early and (at["truncated"] or at["both"]):
         num = sum(one.episodes for one in early)
         yield (
             "note",
@@ -94,5 +97,5 @@ def in_words(ends: DroppedEnds | None) -> str:
     if ends is None:
         return ""
     nums = {kind: sum(one.episodes for one in getattr(ends, kind)) for kind in KINDS}
-    told = ", ".join(f"{num} {kind}" for kind, num in nums.items())
+    told = ", ".join(f"{num} {kind}" for kind, num in nums.items() if num or kind != "both")
     return f"; in the logs {told}, which was dropped with their last actions"

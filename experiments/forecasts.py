@@ -156,10 +156,14 @@ def _num_outputs(spec: EnvSpec) -> int:
 
 
 def _bytes_of_trajectory(spec: EnvSpec) -> int:
-    """Bytes of the longest trajectory in a batch: observations, actions and achieved goals of 4 bytes."""
+    """Bytes of the longest trajectory in a batch, with all arrays that a dataset can have by step.
+
+    These are observations, executed and intended actions, achieved goals and outcomes, and whether a goal
+    was reached.
+    """
     obs = math.prod(spec.obs.shape) * np.dtype(spec.obs.dtype).itemsize
     action = 1 if isinstance(spec.actions, Discrete) else spec.actions.size
-    return int(spec.horizon * (obs + 4 * action + 4 * spec.goal_dim))
+    return int(spec.horizon * (obs + 2 * 4 * action + 2 * 4 * spec.goal_dim + 1))
 
 
 def _num_weights(params: Any) -> int:

@@ -28,8 +28,8 @@ from mgpo_jax.progress import Progress
 class Writer:
     """Writes trajectories one after the other; all must have the same arrays, shapes and dtypes."""
 
-    def __init__(self, place: Path) -> None:
-        self.place, self.grown = place, GrowingFiles(place)
+    def __init__(self, files: GrowingFiles) -> None:
+        self.place, self.grown = files.folder, files
         self.lengths: list[int] = []
 
     def add(self, who: str, rows: Rows) -> None:
@@ -66,8 +66,12 @@ def import_dataset(config: ImportConfig) -> str:
     """
     assert config.out is not None
     skipped: list[str] = []
-    with opened(config.source) as source, new_folder(config.out) as place:
-        converter, writer, ends = Converter(config, source), Writer(place), Tally()
+    with (
+        opened(config.source) as source,
+        new_folder(config.out) as place,
+        GrowingFiles(place) as files,
+    ):
+        converter, writer, ends = Converter(config, source), Writer(files), Tally()
         horizon = _horizon(config, source)
         with Progress(source.num, "episode") as progress:
             for who, arrays in source.episodes:

@@ -12,7 +12,6 @@ from envs.errors import DataError, UsageError
 from experiments import ablations, glance, robustness
 from experiments.comparisons import (
     PICTURES,
-    PUBLISHED,
     SMOKE_TASKS,
     Cell,
     cell_config,
@@ -25,12 +24,11 @@ from experiments.store import runs
 from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.metrics import METRICS, cpu_seconds_of_training, read_metrics
 from experiments.store.reproduce_settings import ABLATIONS, COMPARISONS, GLANCE, ReproduceConfig
-from experiments.store.settings import DEFAULT_WORLD, PretrainConfig, file_name
+from experiments.store.settings import DEFAULT_WORLD, PretrainConfig
 from experiments.store.speeds import (
     cpu_seconds_of,
     num_episodes,
     rate_of,
-    rates_in,
     shipped_rates,
 )
 from experiments.store.tables import table
@@ -212,7 +210,6 @@ def _estimate(config: ReproduceConfig, settings: AdaptConfig) -> float | None:
 def seconds_per_episode(world: str, method: Method) -> float | None:
     """CPU-seconds per episode in the published adaptations in a world; None if none are similar.
 
-    Outside of a clone, where there are no published results, the rates are those in the package.
+    The rates are those in the package (``store/speeds.json``).
     """
-    folder = (PUBLISHED / file_name(world)).absolute()
-    return rate_of(rates_in(folder) if folder.is_dir() else shipped_rates(world), method)
+    return rate_of(shipped_rates(world), method)

@@ -272,12 +272,18 @@ def _react(event: str, member: Member, text: str, go_on: str) -> None:
     elif event == processes.FAILED:
         _faults[member.number] = text
         _failed.wait(SAME)  # this process may meet the same error, and would report it itself
-        if not (_failed.is_set() or signals.is_leaving()):
+        if _may_end():
             _end(f"{member} failed: {text}")
-    elif not (_failed.is_set() or signals.is_leaving()):
+    elif not _faults and _may_end():  # processes that end because of a known fault are not news
         _end(f"{member} (pid {member.pid}) has ended unexpectedly; {go_on}")
 
 
+def _may_end() -> bool:
+    """Whether the calling thread is the one that ends this process because of another process."""
+    return not (_failed.is_set() or signals.is_leaving()) and _first.acquire(blocking=False)
+
+
+_first = threading.Lock()  # taken by the first thread that ends this process because of another one
 _ending = threading.Event()  # set when this process ends because of another one
 _failed = threading.Event()  # set when this process fails because of an error of its own
 _faults: dict[int, str] = {}  # error messages of other processes, by their numbers

@@ -99,7 +99,10 @@ def _check_neighbor() -> None:
     Raises:
       ImportError: if it is another one.
     """
-    spec = importlib.util.find_spec("envs")
+    try:
+        spec = importlib.util.find_spec("envs")
+    except ValueError:  # a module was put under that name by hand
+        spec = None
     places = list(spec.submodule_search_locations or [spec.origin or ""]) if spec else []
     wanted = Path(__file__).parent.parent / "envs"
     if not any(os.path.realpath(place) == os.path.realpath(wanted) for place in places):

@@ -89,12 +89,18 @@ def connected(places: Sequence[str], port: int, password: bytes, index: int) -> 
       DataError: if none answers.
     """
     fault = ""
+    share = MEETING / (len(places) + 1)  # so that the last place is tried while the door is open
     for place in places:
         try:
-            link = socket.create_connection((place, port), timeout=MEETING)
+            link = socket.create_connection((place, port), timeout=share)
+        except OSError as error:
+            fault = f"{place}:{port}: {error}"
+            continue
+        try:
             link.sendall(password + struct.pack(">I", index))
             return _with_keepalive(link)
         except OSError as error:
+            link.close()
             fault = f"{place}:{port}: {error}"
     raise DataError(f"process 0 cannot be reached at {fault}; {NETWORK}")
 

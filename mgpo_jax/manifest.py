@@ -81,7 +81,7 @@ class DroppedEnds(BaseModel):
 
     terminated: list[EndCount] = []
     truncated: list[EndCount] = []
-    """Episodes that are marked as truncated, whether or not they are marked as terminated, too."""
+    both: list[EndCount] = []
     neither: list[EndCount] = []
 
 
@@ -153,7 +153,10 @@ def _what_is_there(folder: Path) -> str:
         return ": there is no such folder; give the folder of a dataset, as `mgpo data import` makes it"
     if not folder.is_dir():
         return f": it is a file, and a dataset is a folder; {how}"
-    if (folder / ARRAYS).is_file():
+    mapped = all(
+        (folder / f"{name}.npy").is_file() for name in ("actions", "lengths", "achieved_goals")
+    )
+    if (folder / ARRAYS).is_file() or mapped:
         return f"{missing}; if it is a damaged dataset, {mend_for(folder)}; if not, {how}"
     return f"{missing}, so it was not imported; {how}"
 

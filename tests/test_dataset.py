@@ -359,6 +359,16 @@ def test_logs_that_were_not_imported_are_left_alone(tmp_path, name, read):
     assert "remove" not in str(error.value)
 
 
+@pytest.mark.parametrize("as_files", [False, True])
+def test_a_dataset_that_has_lost_its_manifest_is_collected_or_imported_again(
+    tmp_path, dataset, as_files
+):
+    save_dataset(tmp_path / "data", dataset, {}, mapped=as_files)
+    (tmp_path / "data" / MANIFEST).unlink()
+    with pytest.raises(DataError, match=r"if it is a damaged dataset, remove .*data and collect"):
+        load_dataset(tmp_path / "data", SPEC)
+
+
 ARRAY_DAMAGE = {
     "missing array": (
         lambda a: a.pop("achieved_goals"),

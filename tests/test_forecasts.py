@@ -96,7 +96,7 @@ def test_a_training_is_only_counted(
     assert found["observations"] == "float32[6]"
     assert found["goals"] == "2 numbers"
     assert found["actions"] == "5 discrete"
-    assert found["batches"] == "64 trajectories in parts of 16, at most 147 kB of input"
+    assert found["batches"] == "64 trajectories in parts of 16, at most 201 kB of input"
     assert "time" in found["CPU"]
     assert "about " in found["CPU"]
     pretrain.main(
@@ -104,5 +104,5 @@ def test_a_training_is_only_counted(
     )
     again = json.loads(capsys.readouterr().out)
     assert (again["weights"], again["steps"]) == (606_853, 4_000)
-    assert again["batches"]["bytes"] == 64 * 64 * 4 * (6 + 1 + 2)
+    assert again["batches"]["bytes"] == 64 * 64 * (4 * (6 + 2 * 1 + 2 * 2) + 1)
     assert not list(tmp_path.iterdir())

@@ -13,11 +13,13 @@ import pytest
 
 from envs.errors import DataError, UsageError
 from experiments import runtime
+from experiments.dropped_ends import wrong_ends
 from experiments.importing import import_dataset
 from experiments.soundness import described, examine
 from experiments.store.data_settings import ImportConfig, check_import
 from mgpo_jax.dataset import load_dataset, save_dataset
 from mgpo_jax.files import hash_file
+from mgpo_jax.manifest import DroppedEnds
 
 LENGTHS = (3, 2, 4)
 SPEC = {"name": "toy", "horizon": 4}
@@ -594,10 +596,29 @@ def test_ends_that_were_dropped_are_still_checked():
     }
 
 
-def test_dropped_ends_before_the_horizon_are_a_note():
+def test_dropped_ends_with_both_marks_are_counted_apart():
     episodes = early(walk())
     for episode in episodes:
         episode["timeouts"] = episode["timeouts"] | episode["terminals"]
+    np.savez("both.npz", **only_before_actions(episodes))
+    manifest = imported("both.npz", "both")[1]
+    assert sum(one["episodes"] for one in manifest["dropped_ends"]["both"]) == 8
+    assert examine(Path("both")).num_faults == 0
+    assert "cut early" not in examine(Path("both")).notes
+    assert "4 truncated, 8 both, 0 neither" in described(Path("both"))
+
+
+def test_a_manifest_may_count_no_dropped_ends():
+    assert list(wrong_ends(DroppedEnds(), 5)) == []
+
+
+def test_dropped_ends_before_the_horizon_are_a_note():
+    episodes = early(walk())
+    for episode in episodes:
+        episode["timeouts"], episode["terminals"] = (
+            episode["timeouts"] | episode["terminals"],
+            np.zeros_like(episode["terminals"]),
+        )
     np.savez("cut.npz", **only_before_actions(episodes))
     imported("cut.npz", "cut")
     found = examine(Path("cut"))

@@ -120,8 +120,12 @@ def test_process_0_ends_after_the_others(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(joining, "_ending", threading.Event())
     monkeypatch.setattr(joining.os, "_exit", lambda code: ended.append("process 0"))
 
+    monkeypatch.setattr(joining, "_first", threading.Lock())
+    monkeypatch.setattr(joining, "_failed", threading.Event())
+    monkeypatch.setattr(joining, "_faults", {})
+
     def hear(event: str, member: Member, text: str) -> None:
-        joining._end(f"{member} is gone")  # in the thread that receives from process 1
+        joining._react(event, member, text, "")  # in the thread that receives from that process
 
     with teams(3) as (made, _):
         monkeypatch.setattr(made[0], "_heard", hear)
@@ -132,8 +136,42 @@ def test_process_0_ends_after_the_others(monkeypatch: pytest.MonkeyPatch) -> Non
         made[2].leave(wait=False)
         soon(lambda: len(ended) > 1)
         monkeypatch.setattr(processes._present, "team", None)
-    assert ended[:2] == ["process 2", "process 0"]
+    assert ended == ["process 2", "process 0"]
     assert joining._ending.is_set()
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_process_0_names_the_process_that_was_first(
+    fails: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The others end because of it, and are not blamed for that."""
+    printed: list[str] = []
+    done = threading.Event()
+    for name, value in (
+        ("clean_up", lambda: None),
+        ("_print", printed.append),
+        ("_ending", threading.Event()),
+        ("_first", threading.Lock()),
+        ("_failed", threading.Event()),
+        ("_faults", {}),
+        ("SAME", 0.2),
+    ):
+        monkeypatch.setattr(joining, name, value)
+    monkeypatch.setattr(joining.os, "_exit", lambda code: done.set())
+    with teams(3) as (made, _):
+        monkeypatch.setattr(made[0], "_heard", lambda *told: joining._react(*told, "resume"))
+        monkeypatch.setattr(processes._present, "team", made[0])
+        if fails:
+            made[1].tell(processes.FAILED, "no room is left")
+        made[1].leave(wait=False)
+        time.sleep(0.05)
+        made[2].leave(wait=False)
+        assert done.wait(10)
+        time.sleep(0.3)
+        monkeypatch.setattr(processes._present, "team", None)
+    (line,) = printed
+    assert "process 1" in line
+    assert ("failed: no room is left" in line) == fails
 
 
 def test_who_has_come_to_the_end_is_not_missed() -> None:
@@ -405,6 +443,7 @@ def test_devices_are_in_the_order_of_processes(monkeypatch: pytest.MonkeyPatch) 
         ({"CUDA_VISIBLE_DEVICES": "0,1,2,3", "SLURM_STEP_TASKS_PER_NODE": "1(x2)"}, [0, 1, 2, 3]),
         ({"CUDA_VISIBLE_DEVICES": "0,1,2,3", "SLURM_STEP_TASKS_PER_NODE": "4(x2)"}, None),
         ({"CUDA_VISIBLE_DEVICES": "2", "SLURM_STEP_TASKS_PER_NODE": "4(x2)"}, [0]),
+        ({"CUDA_VISIBLE_DEVICES": "0,1", "SLURM_STEP_TASKS_PER_NODE": "4(x2)"}, [0, 1]),
         ({"SLURM_STEP_TASKS_PER_NODE": "2,1(x2)", "SLURM_NODEID": "1"}, []),
         ({"SLURM_STEP_TASKS_PER_NODE": "2,1(x2)", "SLURM_NODEID": "0"}, None),
         ({"CUDA_VISIBLE_DEVICES": "4,5", "OMPI_COMM_WORLD_LOCAL_SIZE": "1"}, [0, 1]),

@@ -157,6 +157,8 @@ def test_the_gradient_does_not_depend_on_devices():
 
 
 EIGHT = """
+import jax
+assert jax.local_device_count() == 8
 from test_training import NETWORK, assert_close, gradient
 found = [gradient(NETWORK, 8, devices)[1:] for devices in (1, 2, 8)]
 for one in found[1:]:

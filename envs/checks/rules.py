@@ -131,9 +131,9 @@ def goal_faults(case: Case) -> Iterator[str]:
 def outcome_faults(case: Case, notes: list[str]) -> Iterator[str]:
     """Episodes that solve their task, but whose outcome is not the goal of that task.
 
-    If the best return of a task is unknown, a reward at the end of an episode counts as a solution, but
-    only in a world that pays nothing positive before. Where every step is paid, as in CartPole, the last
-    reward says nothing, and a note tells that this could not be checked.
+    If the best return of a task is unknown, a reward at the end of an episode counts as a solution. Where
+    rewards are paid before the end, too, as in CartPole, the last one may say nothing: if then no such
+    episode has the goal of its task as outcome, a note tells that this could not be checked.
     """
     steps = case.played.steps
     wanted = np.asarray(jax.vmap(case.env.task_goal)(case.tasks))
@@ -173,7 +173,8 @@ def outcome_faults(case: Case, notes: list[str]) -> Iterator[str]:
 def _pays_on_the_way(case: Case) -> bool:
     """Whether an episode has a positive reward before its last step."""
     rewards = case.played.steps.reward
-    return any((rewards[lane, : max(end, 0)] > 0).any() for lane, end in enumerate(case.ends))
+    before = [end if end >= 0 else None for end in case.ends]  # -1 is the end of none
+    return any((rewards[lane, :end] > 0).any() for lane, end in enumerate(before))
 
 
 def _difference(a: Played, b: Played, tolerance: float = 0.0) -> tuple[int, int, str] | None:
