@@ -7,11 +7,10 @@ jax; every name is loaded when it is first used.
 
 from __future__ import annotations
 
+import functools
 import importlib
 import importlib.util
 import os
-from functools import cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -89,7 +88,7 @@ __all__ = [  # noqa: PLE0604
 ]
 
 
-@cache
+@functools.cache
 def _check_neighbor() -> None:
     """Check that ``envs`` is the package beside this one and not a folder of the user's with that name.
 
@@ -104,7 +103,7 @@ def _check_neighbor() -> None:
     except ValueError:  # a module was put under that name by hand
         spec = None
     places = list(spec.submodule_search_locations or [spec.origin or ""]) if spec else []
-    wanted = Path(__file__).parent.parent / "envs"
+    wanted = os.path.join(os.path.dirname(os.path.dirname(__file__)), "envs")
     if not any(os.path.realpath(place) == os.path.realpath(wanted) for place in places):
         found = os.path.abspath(places[0]) if places else "nothing"
         raise ImportError(
