@@ -16,7 +16,13 @@ from mgpo_jax.released import released_folder
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 OF_EXTRA = re.compile(r"extra\s*==\s*['\"]([^'\"]+)['\"]")
-INDIRECT = ("all", "dev", "docs", "notebook")  # extras for developers, or made of other extras
+INDIRECT = (
+    "all",
+    "browser",
+    "dev",
+    "docs",
+    "notebook",
+)  # extras for developers, or made of other extras
 
 
 class Extra(NamedTuple):

@@ -28,7 +28,7 @@ class ReportConfig(Common):
     """HTML file to write; it is self-contained and needs no server or network."""
     pictures: tuple[Path, ...] = ()
     """PNG and GIF files to show at the end, such as the videos that `experiments.plot` makes; videos in the
-    result folders are always shown."""
+    result folders are shown, too, as far as the page has room."""
     env: Name | None = None
     """Your own world, as module:attribute, if the results are from one; without it no user code is
     imported."""

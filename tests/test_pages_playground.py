@@ -99,6 +99,20 @@ def test_a_search_that_is_stopped_leaves_a_fresh_episode() -> None:
 
 
 @needs_node
+def test_goals_that_are_cleared_during_a_search_stay_cleared() -> None:
+    before, after, found = in_page("""
+    const page = await begun();
+    page.setGoals([[1, 3]]);
+    const before = chips().length;
+    $("find").fire("click");
+    $("clear").fire("click");
+    await later(150);
+    return [before, chips().length, $("found").textContent];
+    """)
+    assert (before, after, found) == (2, 1, "")
+
+
+@needs_node
 def test_the_world_that_was_clicked_last_is_shown_whichever_loads_first() -> None:
     title, pressed = in_page("""
     const names = ["one", "slow", "quick"];

@@ -15,6 +15,7 @@ from made_results import TINY, made_results
 from pages_data import config_of, data_of, saved
 
 import experiments.pages.report as pages
+from envs.errors import UsageError
 from envs.maze import MAZE15
 from envs.page import Page
 from envs.registry import WORLDS
@@ -35,12 +36,28 @@ TRACKED = replace(
     ),
 )
 FILMED = replace(TINY, name="filmed")
+STILL = replace(
+    TINY,
+    name="still",
+    pictures=lambda env: MAZE15.pictures(env)._replace(video=None, frame=None),
+)
 
 
 @pytest.fixture(autouse=True)
 def made_worlds(monkeypatch: pytest.MonkeyPatch) -> None:
-    made, find = {"tiny": DRAWN, "tracked": TRACKED, "filmed": FILMED}, WORLDS.find
+    made, find = (
+        {
+            "tiny": DRAWN,
+            "tracked": TRACKED,
+            "filmed": FILMED,
+            "still": STILL,
+            "mine.py:WORLD": FILMED,
+        },
+        WORLDS.find,
+    )
+    known = WORLDS.known
     monkeypatch.setattr(WORLDS, "find", lambda name: made.get(name) or find(name))
+    monkeypatch.setattr(WORLDS, "known", lambda name, *rest: made.get(name) or known(name, *rest))
 
 
 @pytest.fixture
@@ -121,7 +138,7 @@ def test_tracks_are_not_made_if_there_is_no_room_for_the_rest(
     assert arrays_in(data).keys() == {"returns", "evalEpisodes", "evalReturns", "goals"}
     said = capsys.readouterr().err
     assert data["notes"][0] in said
-    assert "even without details" in said
+    assert "cannot be made smaller" in said
 
 
 def test_pictures_that_have_no_room_are_left_out_before_episodes(tmp_path: Path) -> None:
@@ -151,10 +168,30 @@ def test_a_small_picture_is_kept_behind_a_large_one() -> None:
 def test_a_page_that_cannot_draw_a_world_says_how_to_get_pictures(tmp_path: Path) -> None:
     folder = saved(tmp_path / "filmed", made_results(config=config_of("filmed")))
     notes = data_of(report([folder]))["notes"]
-    assert f"python -m experiments.plot {folder} --tasks 0 --out figures" in notes
-    assert f"python -m experiments.report {folder} --pictures figures/*.gif" in notes
+    assert f"python -m experiments.plot {folder} --tasks 0 --out figures-of-report" in notes
+    assert f"python -m experiments.report {folder} --pictures figures-of-report/*.gif" in notes
+    own = saved(tmp_path / "own", made_results(config=config_of("mine.py:WORLD")))
+    notes = data_of(report([own]))["notes"]
+    flag = "--env mine.py:WORLD"
+    assert f"python -m experiments.plot {own} {flag} --tasks 0 --out figures-of-report" in notes
+    assert f"python -m experiments.report {own} {flag} --pictures figures-of-report/*.gif" in notes
     shutil.copy(ROOT / "docs/playground.png", folder.parent / "a.png")
     assert data_of(report([folder], [folder.parent / "a.png"]))["notes"] == []
+
+
+def test_a_world_without_videos_is_told_no_command_for_them(tmp_path: Path) -> None:
+    folder = saved(tmp_path / "still", made_results(config=config_of("still")))
+    assert data_of(report([folder]))["notes"] == []
+
+
+def test_a_video_in_a_folder_that_is_too_large_is_left_out(tmp_path: Path) -> None:
+    folder = saved(tmp_path / "result", made_results(config=config_of("tiny")))
+    (folder / "long.gif").write_bytes(b"GIF89a" + bytes(3_900_000))
+    data = data_of(report([folder]))
+    assert data["pictures"] == []
+    assert "the pictures long" in data["notes"][0]
+    with pytest.raises(UsageError, match=r"has 5\.2 MB as text in a page, which has 5 MB at most"):
+        report([folder], [folder / "long.gif"])
 
 
 @pytest.mark.slow

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import base64
+import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TypedDict
@@ -21,8 +23,12 @@ class Picture(TypedDict):
     """Its content, as an address of the scheme ``data``."""
 
 
-def read_picture(path: Path, most_bytes: int) -> Picture:
+def read_picture(path: Path, most_bytes: float = math.inf) -> Picture:
     """A picture or a video as data for a page.
+
+    Args:
+      path: its file.
+      most_bytes: the size that a page may have.
 
     Raises:
       UsageError: if it is not a GIF or PNG, or larger than a page may be.
@@ -39,17 +45,21 @@ def read_picture(path: Path, most_bytes: int) -> Picture:
     source = f"data:image/{path.suffix[1:]};base64,{base64.b64encode(content).decode()}"
     if len(source) > most_bytes:
         raise UsageError(
-            f"{path} has {len(content) / 1e6:.1f} MB, a page {most_bytes / 1e6:.0f} MB at most; draw fewer "
-            "tasks or a shorter video"
+            f"{path} has {len(source) / 1e6:.1f} MB as text in a page, which has {most_bytes / 1e6:.0f} MB "
+            "at most; draw fewer tasks or a shorter video"
         )
     return {"name": path.stem.replace("_", " "), "source": source}
 
 
 def those_with_room(pictures: Sequence[Picture], room: int) -> tuple[list[Picture], list[str]]:
-    """The pictures that fit into some bytes, the first ones first, and the names of the others."""
+    """The pictures that fit into some bytes, the first ones first, and the names of the others.
+
+    Each may need room for its name in a note instead.
+    """
     kept, others = [], []
+    room -= sum(len(json.dumps(picture["name"])) + 2 for picture in pictures)
     for picture in pictures:
-        size = len(picture["source"]) + len(picture["name"]) + 64  # as JSON
+        size = len(picture["source"]) + len(json.dumps(picture["name"])) + 64  # as JSON
         if size <= room:
             kept.append(picture)
             room -= size

@@ -69,7 +69,8 @@ def report(folders: Sequence[Path], pictures: Sequence[Path] = ()) -> str:
     """
     found = {folder: load_results(folder) for folder in dict.fromkeys(folders)}
     videos = [path for folder in dict.fromkeys(folders) for path in sorted(folder.glob("*.gif"))]
-    shown = [read_picture(path, MOST_BYTES) for path in dict.fromkeys([*pictures, *videos])]
+    named = [read_picture(path, MOST_BYTES) for path in dict.fromkeys(pictures)]
+    shown = [*named, *(read_picture(path) for path in videos if path not in pictures)]
     rows = [read_row(folder) for folder in found]
     first_folder, first = next(iter(found.items()))
     for folder, results in found.items():
@@ -79,7 +80,7 @@ def report(folders: Sequence[Path], pictures: Sequence[Path] = ()) -> str:
             )
     page = _largest_page(found, rows, shown)
     if (size := len(page.encode())) > MOST_BYTES:
-        print(f"the report has {size / 1e6:.1f} MB, even without details", file=sys.stderr)
+        print(f"the report has {size / 1e6:.1f} MB, and cannot be made smaller", file=sys.stderr)
     return page
 
 
@@ -105,7 +106,7 @@ def _largest_page(
             break
     if detail == Detail.NO_TRACKS and size_of(whole := data_of(Detail.ALL)) <= MOST_BYTES:
         data = whole
-    kept, others = those_with_room(pictures, MOST_BYTES - size_of(data))
+    kept, others = those_with_room(pictures, MOST_BYTES - size_of(data) - len(LARGE))
     left_out = [
         *data["notes"],
         *([LARGE.format("the pictures " + ", ".join(others))] if others else []),
@@ -185,14 +186,19 @@ def _how_to_draw(first: Results) -> list[str]:
 
     The page shows a note that begins with ``python`` as a command.
     """
-    if page_of(first.world).script is not None or first.world.pictures is None:
+    make = first.world.pictures
+    if page_of(first.world).script is not None or make is None or first.best_goals(0, 0) is None:
+        return []
+    pictures = make(first.world.make())
+    if not (pictures.video or pictures.frame):
         return []
     folder = shlex.quote(str(first.folder))
+    own = f" --env {shlex.quote(first.env)}" if ":" in first.env else ""
     return [
         "This page cannot draw the episodes of this world. Pictures and videos of them are made by",
-        f"python -m experiments.plot {folder} --tasks 0 --out figures",
+        f"python -m experiments.plot {folder}{own} --tasks 0 --out figures-of-report",
         "and are shown at the end of the page that is made by",
-        f"python -m experiments.report {folder} --pictures figures/*.gif",
+        f"python -m experiments.report {folder}{own} --pictures figures-of-report/*.gif",
     ]
 
 

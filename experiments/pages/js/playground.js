@@ -201,7 +201,7 @@ export class Playground {
       return this.endPainting();
     }
     const { stage } = this, goal = stage.world.goalAt(this.facts, stage.task, spot);
-    if (!goal) return;
+    if (!goal) return this.announce(stage.tellSpot(spot));
     if (!stage.hasRoom) {
       const text = `A prompt has at most ${stage.data.network.max_prompt_length} goals.`;
       byId("verdict").textContent = text;
@@ -270,7 +270,7 @@ export class Playground {
   async find() {
     this.halted(() => {});
     this.searching = true;
-    const { stage } = this, { task } = stage;
+    const { stage } = this, { task, waypoints } = stage;
     this.setActing(false);
     byId("progress").hidden = false;
     let last = performance.now();
@@ -285,7 +285,10 @@ export class Playground {
     this.searching = false;
     this.setActing(true);
     if (this.stage !== stage) return;
-    if (stage.task !== task) return this.show();
+    if (stage.task !== task || stage.waypoints !== waypoints) { // the user has changed them meanwhile
+      this.clearFound();
+      return this.show();
+    }
     this.setGoals(prompt.slice(0, -1));
     this.showFound(returns);
   }

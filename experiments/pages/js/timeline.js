@@ -40,7 +40,7 @@ export function timelineRows(parts, reached, goalName) {
  */
 export function timeline(log, { seed, task, episode }, parts, goalName) {
   const reached = log.reached(seed, task, episode), { names, rows } = timelineRows(parts, reached, goalName);
-  const last = Math.max(1, ...range(log.numEpisodes).flatMap((e) => log.reached(seed, task, e).map(({ step }) => step)));
+  const last = range(log.numEpisodes).reduce((most, e) => log.reached(seed, task, e).reduce((m, { step }) => Math.max(m, step), most), 1);
   const width = chartWidth(640), longest = Math.max(0, ...names.map((name) => Math.min(name.length, LONGEST)));
   const left = Math.max(60, 20 + 7.6 * longest), x = scale(0, last, left, width - 24), height = ROW * names.length + 34;
   const middle = (/** @type {number} */ row) => ROW * (row + 0.5);
