@@ -296,7 +296,7 @@ def test_pictures_and_videos_stand_below(tmp_path: Path, result: Path) -> None:
     [
         ("a.png", b"<svg>", "is not a picture that a page can show"),
         ("a.svg", b"<svg>", "is not a picture that a page can show"),
-        ("a.gif", b"GIF89a" + bytes(4_000_000), "4.0 MB, a page 5 MB at most"),
+        ("a.gif", b"GIF89a" + bytes(4_000_000), "5.3 MB as text in a page, which has 5 MB at most"),
         ("none.gif", None, "cannot be read: No such file"),
     ],
 )
