@@ -392,6 +392,7 @@ def adapted(place: Path) -> Path:
     return place / "one"
 
 
+@pytest.mark.slow
 def test_an_evaluation_has_the_bits_of_one_process(place: Path, adapted: Path) -> None:
     words = "evaluate one --env own_world:WORLD --episodes 2 --action-noise 0 0.2"
     (code, out, err), second = both(f"{words} --json both.json", place)
