@@ -203,7 +203,7 @@ def _has_ended(config: PretrainConfig) -> bool:
 def _train_and_save(run: Run, go_on: str) -> None:
     """Take the steps of a training, and write checkpoints, metrics, the policy and its curve."""
     config, folder = run.config, run.folder
-    if config.data.data_folder is None:  # otherwise it was printed with the recipe
+    if config.data.data_folder is None and not config.resume:  # else it was printed before
         print(schedule(config), file=sys.stderr)
     blank = run.initial_state()
     before = _snapshot_to_resume(run, blank) or Snapshot(blank, [], [])
