@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
@@ -61,7 +62,7 @@ def _read(path: Path) -> dict[str, Json]:
       UsageError: if it is a folder, or the config of a policy.
       DataError: if it is missing, damaged or no JSON object.
     """
-    if path.is_dir():
+    if os.path.isdir(path):  # which, unlike Path.is_dir, also takes names that are too long
         inside = path / CONFIG
         mend = f"give {inside}" if inside.is_file() else MEND
         raise UsageError(f"--config {path} must be a file, found a folder; {mend}")
