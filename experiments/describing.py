@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.soundness import Findings
+from experiments.soundness import Findings, num_ends, returns_of
 from mgpo_jax.dataset import load_dataset
 from mgpo_jax.manifest import read_facts
 
@@ -33,16 +33,7 @@ def facts_of(folder: Path) -> dict[str, Any]:
     """
     facts = read_facts(folder)
     dataset, manifest = load_dataset(folder, any_value=True)
-    returns = None
-    if dataset.rewards is not None:
-        returns = np.add.reduceat(np.asarray(dataset.rewards, np.float64), dataset.starts)
-    ends = None
-    if dataset.terminated is not None and dataset.truncated is not None:
-        ends = {
-            "terminated": int(dataset.terminated.sum()),
-            "truncated": int(dataset.truncated.sum()),
-        }
-        ends["neither"] = int(np.sum(~dataset.terminated & ~dataset.truncated))
+    returns = returns_of(dataset)
     return {
         "folder": str(folder),
         "sha256": manifest["sha256"],
@@ -57,7 +48,7 @@ def facts_of(folder: Path) -> dict[str, Any]:
         "actions": {"discrete": facts.num_actions, "size": facts.action_dim},
         "goals": {"size": facts.goal_dim, "reached": float(np.mean(dataset.goal_reached))},
         "returns": None if returns is None else _spread(returns),
-        "ends": ends,
+        "ends": num_ends(dataset),
         "dropped_ends": manifest.get("dropped_ends"),
         "bytes": sum(array.nbytes for array in dataset.arrays.values()),
     }

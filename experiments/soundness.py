@@ -378,24 +378,32 @@ def _counts(actions: np.ndarray, num: int) -> str:
     return f"{text}, .." if num > 20 else text
 
 
-def _returns(dataset: Dataset) -> str:
+def returns_of(dataset: Dataset) -> np.ndarray | None:
+    """The return of each trajectory; None without rewards."""
     if dataset.rewards is None:
+        return None
+    return np.add.reduceat(np.asarray(dataset.rewards, np.float64), dataset.starts)
+
+
+def num_ends(dataset: Dataset) -> dict[str, int] | None:
+    """The number of trajectories that ended in each way; None if it is not known."""
+    if dataset.terminated is None or dataset.truncated is None:
+        return None
+    neither = ~dataset.terminated & ~dataset.truncated
+    ways = {"terminated": dataset.terminated, "truncated": dataset.truncated, "neither": neither}
+    return {way: int(rows.sum()) for way, rows in ways.items()}
+
+
+def _returns(dataset: Dataset) -> str:
+    if (returns := returns_of(dataset)) is None:
         return "not known, since there are no rewards"
-    returns = np.add.reduceat(np.asarray(dataset.rewards, np.float64), dataset.starts)
     quartiles = ", ".join(f"{q:.4g}" for q in np.percentile(returns, [0, 25, 50, 75, 100]))
     return f"mean {returns.mean():.4g}; quartiles {quartiles}"
 
 
 def _ends(dataset: Dataset) -> str:
-    if dataset.terminated is None or dataset.truncated is None:
-        return "not known"
-    neither = ~dataset.terminated & ~dataset.truncated
-    counts = (
-        ("terminated", dataset.terminated),
-        ("truncated", dataset.truncated),
-        ("neither", neither),
-    )
-    return ", ".join(f"{rows.sum()} {name}" for name, rows in counts)
+    nums = num_ends(dataset)
+    return "not known" if nums is None else ", ".join(f"{num} {way}" for way, num in nums.items())
 
 
 def _size(folder: Path, dataset: Dataset) -> str:
