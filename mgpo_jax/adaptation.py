@@ -233,12 +233,18 @@ def _round(
 ) -> tuple[AdaptState, AdaptLog]:
     """Run one round of the search or, if not ``searching``, one judging episode, which keeps the state."""
     key, key_ask, key_run, key_tell = jax.random.split(state.key, 4)
-    choice, asked = adapter.ask(key_ask, state.search)
     num = adapter.episodes_per_round
     keys = key_run[None] if num == 1 else jax.random.split(key_run, num)
-    if judge_key is not None:
-        choice, asked = choose(
-            searching, (choice, asked), (adapter.best(state.search), state.search)
+
+    def ask() -> tuple[Any, Any]:
+        return adapter.ask(key_ask, state.search)
+
+    if judge_key is None:
+        choice, asked = ask()
+    else:
+        # A branch rather than a selection, because a method may search for long before it chooses.
+        choice, asked = jax.lax.cond(
+            searching, ask, lambda: (adapter.best(state.search), state.search)
         )
         # All methods are judged with the same keys, however many episodes their rounds have.
         judge_keys = jnp.broadcast_to(judge_key, keys.shape)

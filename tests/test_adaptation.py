@@ -189,9 +189,9 @@ def test_equal_worlds_and_other_tasks_share_one_program(params, tasks, whole):
     assert adapt_one._cache_size() == before
 
 
-@partial(jax.jit, static_argnames=("env", "num_judged", "max_rounds"))
-def judged_search(params, key, env, task, num_rounds, max_rounds, num_judged):
-    adapter = make_adapter(env, params)
+@partial(jax.jit, static_argnames=("env", "num_judged", "max_rounds", "adapter"))
+def judged_search(params, key, env, task, num_rounds, max_rounds, num_judged, adapter=None):
+    adapter = adapter or make_adapter(env, params)
     state = start(key, env, adapter, task)
     judge_key = jax.random.key(9) if num_judged else None
     return proceed(
@@ -240,6 +240,21 @@ def test_judging_episodes_are_run_once_each(params, tasks):
     judged_search(params, KEY, env, lane(tasks, 1), 2, NUM_EPISODES, 3)
     jax.effects_barrier()
     assert CountingMaze.episodes == 2 + 3
+
+
+def test_judging_episodes_choose_nothing(params, tasks):
+    """A method may search for long before it chooses, so it is only asked in rounds of the search."""
+    env, asked = make_env(), []
+    adapter = make_adapter(env, params)
+
+    def ask(key, state):
+        jax.debug.callback(lambda: asked.append(True))
+        return adapter.ask(key, state)
+
+    counting = adapter._replace(ask=ask)
+    judged_search(params, KEY, env, lane(tasks, 1), 2, NUM_EPISODES, 3, counting)
+    jax.effects_barrier()
+    assert len(asked) == 2
 
 
 def test_actions_in_the_log_are_bytes(params, tasks, whole):
