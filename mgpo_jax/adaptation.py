@@ -48,8 +48,8 @@ class Adapter(NamedTuple):
     """Whether ``vmap`` over tasks runs ``tell`` for one task after another. This saves memory where an
     update is large."""
     num_scored: Callable[[Any], Int[Array, ""]] | None = None
-    """``(state) -> number`` of prompts that were scored by the policy's likelihoods so far, without running
-    an episode; None for methods that learn from episodes alone."""
+    """``(state) -> number`` of prompts that were rehearsed so far: the policy acted under them in a model
+    of the task, without an episode. None for methods that learn from episodes alone."""
 
 
 class AdaptState(NamedTuple):
@@ -83,8 +83,8 @@ class AdaptLog(NamedTuple):
     played: Played
     """The episodes, [R, K, ..]."""
     num_scored: Int[Array, "*batch R"] | None = None
-    """Cumulative number of prompts scored without an episode at the end of each round; None if the method
-    scores none (``Adapter.num_scored``)."""
+    """Cumulative number of prompts rehearsed at the end of each round; None if the method rehearses none
+    (``Adapter.num_scored``)."""
 
 
 class Judged(NamedTuple):

@@ -61,8 +61,8 @@ class Outcome(NamedTuple):
     """``[S, N, C, M]``: fraction of the judging episodes that achieved each of the world's M named goals;
     None in worlds without named goals (``Environment.goal_names``)."""
     num_scored: np.ndarray | None = None
-    """``[S, N, R]``: cumulative number of prompts scored without an episode at the end of each round; None
-    for methods that learn from episodes alone."""
+    """``[S, N, R]``: cumulative number of prompts rehearsed without an episode at the end of each round;
+    None for methods that learn from episodes alone."""
 
 
 class Part(NamedTuple):

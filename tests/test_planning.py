@@ -15,6 +15,7 @@ from envs.base import Episode, Goals, Trajectory
 from envs.maze.env import MazeRunner, MazeTask
 from mgpo_jax.adaptation import search
 from mgpo_jax.distributions import Categorical
+from mgpo_jax.optimizers.arms import empty_arms
 from mgpo_jax.optimizers.base import SearchSpace
 from mgpo_jax.optimizers.methods import prompt_adapter
 from mgpo_jax.planning import worths
@@ -37,6 +38,7 @@ from mgpo_jax.planning.table import (
     steps_to,
     way_to,
 )
+from mgpo_jax.planning.trials import mean_steps, most_promising, with_result
 from mgpo_jax.planning.worths import (
     SHARE_OF_PROMPT,
     Posterior,
@@ -303,13 +305,21 @@ def test_changed_prompts_are_prompts_of_the_way():
     assert same.mask.tolist() == alone.mask.tolist()
 
 
-def adapted(tasks, features=Features(), num_episodes=30, policy=POLICY, num_states=100):  # noqa: B008
+def adapted(
+    tasks,
+    features=Features(),  # noqa: B008
+    num_episodes=30,
+    policy=POLICY,
+    num_states=100,
+    deterministic=True,
+):
     space = SearchSpace(
         num_slots=policy.num_slots,
         horizon=WORLD.horizon,
         return_range=WORLD.spec.return_range,
         num_episodes=num_episodes,
         sample_goal=WORLD.sample_goal,
+        deterministic=deterministic,
     )
     optimizer = plan_map(space, WORLD.spec, policy, num_states, features)
     adapter = prompt_adapter(policy, optimizer)
@@ -347,7 +357,7 @@ def test_the_best_prompt_is_worth_what_was_seen_of_it(finals):
 @pytest.mark.slow
 def test_lanes_equal_single_searches(tasks, finals):
     result, _ = finals
-    alone, _ = adapted(jax.tree.map(lambda leaf: leaf[:1], tasks))
+    alone, _ = adapted(task_rows(tasks, 1))
     np.testing.assert_array_equal(alone.log.returns[0], result.log.returns[0])
 
 
@@ -393,6 +403,76 @@ def test_prompts_of_one_goal_still_adapt(tasks):
         prompts, np.broadcast_to(jax.vmap(WORLD.task_goal)(tasks)[:, None, None], prompts.shape)
     )
     np.testing.assert_allclose(returns, result.log.returns[:, 0, 0], atol=1e-5)
+
+
+def test_a_task_that_cannot_be_solved_ends_like_any_other(tasks):
+    """The goal is walled in, so no episode reaches it and no path to it is ever known."""
+    first = task_at(tasks, 0)
+    row, column = first.goal
+    walls = first.maze.at[row - 1 : row + 2, column - 1 : column + 2].set(1)
+    assert WORLD.optimal_return(first) > WORLD.spec.return_range[0]
+    task = MazeTask(walls.at[row, column].set(0)[None], first.goal[None])
+    result, returns = adapted(task, num_episodes=8)
+    worst = WORLD.spec.return_range[0]
+    np.testing.assert_allclose(result.log.returns, worst, atol=1e-5)
+    np.testing.assert_allclose(returns, worst, atol=1e-5)
+
+
+class TestTrialsUnderNoise:
+    """In a stochastic world the return of one episode is partly luck."""
+
+    def prompts(self, *returns):
+        table = empty_arms(4, NUM_SLOTS, 2)
+        for index, several in enumerate(returns):
+            query = Query(self.prompt(index), jnp.ones((), bool))
+            for return_ in several:
+                table = with_result(table, query, jnp.float32(return_))
+        return table
+
+    def prompt(self, index):
+        return prompt_of([[float(index), 1.0]], NUM_SLOTS)
+
+    def test_a_prompt_that_was_lucky_once_is_run_again(self):
+        chosen = most_promising(self.prompts([-0.5, -0.6, -0.4], [-0.3]))
+        assert chosen.goals[-1, 0] == 1
+
+    def test_a_prompt_that_is_surely_worse_is_not(self):
+        chosen = most_promising(self.prompts([-0.1] * 12, [-0.9] * 3))
+        assert chosen.goals[-1, 0] == 0
+
+    def test_mean_steps_are_those_of_the_episodes(self):
+        table, means = self.prompts(), jnp.full(4, 99.0)
+        for index, steps in ((0, 10), (1, 30), (0, 20), (0, 60)):
+            prompt = self.prompt(index)
+            table = with_result(table, Query(prompt, jnp.ones((), bool)), jnp.float32(-steps))
+            means = mean_steps(means, table, prompt, jnp.int32(steps))
+        np.testing.assert_allclose(means[:2], [30, 30])
+
+    def test_every_second_episode_repeats_a_prompt(self, tasks):
+        """Once a path is known; what is repeated was run greedily before."""
+        result, _ = adapted(task_rows(tasks, 4), deterministic=False)
+        queries = jax.tree.map(np.asarray, result.log.choices)
+        again = 0
+        for lane in range(4):
+            seen = set()
+            for turn in range(30):
+                prompt = queries.prompt.goals[lane, turn].tobytes()
+                known = prompt in seen
+                again += known
+                if queries.greedy[lane, turn]:
+                    assert known or turn % 2 == 1 or turn == 0 or not solved(result, lane, turn)
+                    seen.add(prompt)
+        assert again > 30
+
+
+def solved(result, lane, turn):
+    """Whether any episode before this one reached the task goal."""
+    worst = WORLD.spec.return_range[0]
+    return bool((np.asarray(result.log.returns)[lane, :turn] > worst + 1e-4).any())
+
+
+def task_rows(tasks, num):
+    return jax.tree.map(lambda leaf: leaf[:num], tasks)
 
 
 NUM_GOALS = 5

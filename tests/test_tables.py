@@ -155,6 +155,28 @@ def test_the_published_table_is_that_of_the_results(
     assert capsys.readouterr().out == Path("results/table.md").read_text()
 
 
+def test_the_table_of_the_plan_is_that_of_the_results() -> None:
+    """Of `docs/plan.md`: regret or return after some numbers of episodes, and the CPU time."""
+    text = (ROOT / "docs" / "plan.md").read_text()
+    (rows,) = re.findall(r"\| world \| method \| 10 \|.*\n\| ---.*\n((?:\|.*\n)+)", text)
+    world, measure, num = "", "", 0
+    for line in rows.splitlines():
+        name, method, *numbers = (cell.strip(" *") for cell in line.strip("|").split("|"))
+        if name:
+            world, measure = name.split(", ")
+        folder = RESULTS / {"RA-DT's mazes": "radt"}.get(world, world) / method.lower()
+        results = load_results(folder)
+        shown = [float(number) for number in numbers]
+        after = np.searchsorted(results.eval_episodes, (10, 20, 40, 100))
+        means = results.eval_returns[:, :, after].mean(axis=(0, 1))
+        if measure == "regret":
+            means = np.mean(results.optimal_returns) - means
+        np.testing.assert_allclose(shown[:4], means, atol=0.00051)
+        assert shown[4] == round(read_summary(folder)["cpu_seconds"])
+        num += 1
+    assert num == 12
+
+
 def test_the_published_tables_over_time_are_those_of_the_results(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

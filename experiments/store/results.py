@@ -51,8 +51,8 @@ class Results:
     """[S, N, C, M] shares of the judging episodes that achieved each of the world's M named goals; None in
     worlds without any."""
     num_scored: np.ndarray | None = None
-    """[S, N, R] prompts scored without an episode until the end of each round; None for methods that only
-    learn from episodes."""
+    """[S, N, R] prompts rehearsed without an episode until the end of each round; None for methods that
+    only learn from episodes."""
     lengths: np.ndarray | None = None
     """[S, N, E] steps of the episodes."""
     keys: np.ndarray | None = None

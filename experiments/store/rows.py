@@ -220,7 +220,7 @@ HEAD = (
 
 FURTHER: Mapping[str, tuple[str, Callable[[Summary], str]]] = {
     "episodes used": ("episodes_used", lambda summary: f"{summary['episodes_used']:.1f}"),
-    "prompts scored": ("prompts_scored", lambda summary: f"{summary['prompts_scored']:.0f}"),
+    "prompts rehearsed": ("prompts_scored", lambda summary: f"{summary['prompts_scored']:.0f}"),
     "success rate": ("success_rate", lambda summary: f"{100 * summary['success_rate']:.1f} %"),
     "SPL": ("spl", lambda summary: f"{summary['spl']:.3f}"),
     "best single episode": ("fresh", lambda summary: f"{summary['best_episode_return']:.2f}"),

@@ -196,7 +196,7 @@ def of_arrivals(
 
 
 def _scoring_entries(results: Results) -> dict[str, Any]:
-    """The entry ``prompts_scored``; empty for methods that do not score prompts."""
+    """The entry ``prompts_scored``; empty for methods that do not rehearse prompts."""
     if results.num_scored is None:
         return {}
     return {"prompts_scored": float(results.num_scored[:, :, -1].mean())}

@@ -97,9 +97,7 @@ def printed(summary: Mapping[str, Any]) -> str:
     if scored := summary.get("prompts_scored"):
         num = summary["num_tasks"] * summary["num_seeds"]
         each = summary["cpu_seconds"] / num
-        rows.append(
-            ("a search", f"{scored:.0f} prompts scored by the policy, {each:.2f} CPU-seconds")
-        )
+        rows.append(("a search", f"{scored:.0f} prompts rehearsed, {each:.2f} CPU-seconds"))
     if failed:
         rows.append(("failed episodes", f"{failed} (the simulation failed)"))
     rows.append(

@@ -30,8 +30,8 @@ class PromptOptimizer(NamedTuple):
     best: Callable[[Any], Prompt]
     """``(state) -> prompt``: the best prompt so far."""
     num_scored: Callable[[Any], Int[Array, ""]] | None = None
-    """``(state) -> number`` of prompts that were scored by the policy's likelihoods so far, without running
-    an episode; None for optimizers that learn from episodes alone."""
+    """``(state) -> number`` of prompts that were rehearsed so far: the policy acted under them in a model
+    of the task, without an episode. None for optimizers that learn from episodes alone."""
 
 
 @dataclass(frozen=True, kw_only=True)

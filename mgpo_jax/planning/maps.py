@@ -8,8 +8,12 @@ The first episode evaluates (g^M). Every later episode is spent on one of three 
 - exploration: actions are sampled under a random prompt of the known path, or under one that leads to a
   frontier, a state from which the task goal could be reached sooner than by the known path.
 
-In the first two cases actions are greedy. Without rehearsals (an ablation) their prompts are random goals
-of the known path.
+In the first two cases actions are greedy. A prompt of the second kind is never run twice in a row. Without
+rehearsals (an ablation) the prompts of these two kinds are random goals of the known path.
+
+In a stochastic world no rehearsal is certain, and the return of one episode is partly luck. There every
+second episode repeats one of the prompts that were run before, the one with the highest upper bound on its
+mean return, and prompts are compared by their mean numbers of steps.
 
 A full map ignores further states. If the best episode reached the task goal through such states, sooner
 than any path in the map does, prompts are drawn from that episode instead, as in the paper.
@@ -52,7 +56,7 @@ from mgpo_jax.planning.table import (
     forgotten,
     way_to,
 )
-from mgpo_jax.planning.trials import with_result
+from mgpo_jax.planning.trials import mean_steps, most_promising, with_result
 from mgpo_jax.policy import Policy
 from mgpo_jax.prompts import Prompt, sample_prompt, single_goal
 from mgpo_jax.rollout import Query
@@ -75,8 +79,14 @@ class MapState(NamedTuple):
     """How often each state was chosen as the frontier to explore."""
     prompts: Arms
     """The prompts that were run greedily, with their returns."""
+    steps: Float[Array, "M"]
+    """The mean number of steps in which each of them reached the task goal. An episode that did not reach
+    it counts as one step more than the longest episode."""
+    hoped: Bool[Array, ""]
+    """Whether the latest prompt was one that may be better."""
     verified: Int[Array, ""]
-    """Steps of the shortest greedy episode that reached the task goal; ``FAR`` if none has."""
+    """Steps of the shortest greedy episode that reached the task goal, ``FAR`` if none has; in a stochastic
+    world, the mean number of steps of the best prompt, rounded up."""
     best_return: Float[Array, ""]
     """The best return of any episode."""
     latest: Goals
@@ -88,7 +98,7 @@ class MapState(NamedTuple):
     memory: Memory
     """The prompts that the latest search passes on to the next one."""
     patience: Int[Array, ""]
-    """Number of episodes between searches; it doubles when a search finds nothing."""
+    """Number of episodes between searches; it doubles when a search leads to no better prompt."""
     wait: Int[Array, ""]
     """Number of episodes until the next search."""
     shortest: Int[Array, ""]
@@ -127,6 +137,8 @@ def plan_map(
             start=jnp.int32(0),
             choices=jnp.zeros(num_states, jnp.int32),
             prompts=empty_arms(num_arms, space.num_slots, goal_dim),
+            steps=jnp.zeros(num_arms),
+            hoped=jnp.zeros((), bool),
             verified=jnp.int32(FAR),
             best_return=jnp.float32(-jnp.inf),
             latest=no_goals(space.horizon, goal_dim),
@@ -169,8 +181,9 @@ def _next_query(tools: Tools, key: PRNGKeyArray, state: MapState) -> tuple[Query
         )
 
     turn = state.num_asked
+    repeats = (not space.deterministic) & (turn % 2 == 0) & (known < FAR)
     may_gain = (known < state.verified) & (known < FAR)
-    wanted = may_gain & ((state.wait == 0) | (known < state.shortest))
+    wanted = may_gain & ~repeats & ((state.wait == 0) | (known < state.shortest))
     found = nothing_found(state.memory)
     if features.rounds:
         result: Found = jax.lax.cond(wanted, search, lambda: found)
@@ -187,18 +200,20 @@ def _next_query(tools: Tools, key: PRNGKeyArray, state: MapState) -> tuple[Query
     hopeful = choose(beyond, Offer(of_best, state.best_steps < state.verified), found.hopeful)
     found = found._replace(hopeful=hopeful)
     explores, frontier = explore(key_explore, tools, state, way)
-    hopes = found.hopeful.exists & (turn % 2 == 0)
-    greedy = (turn == 0) | found.sure.exists | hopes
-    prompt = choose(
-        turn == 0,
-        single_goal(state.task_goal, space.num_slots),
-        choose(found.sure.exists, found.sure.prompt, choose(hopes, found.hopeful.prompt, explores)),
-    )
+    hopes = found.hopeful.exists & ~state.hoped & ~found.sure.exists & ~repeats
+    offer = choose(hopes, found.hopeful, found.sure)
+    offer = choose(repeats, Offer(most_promising(state.prompts), repeats), offer)
+    first = turn == 0
+    greedy = first | offer.exists
+    prompt = choose(offer.exists, offer.prompt, explores)
+    prompt = choose(first, single_goal(state.task_goal, space.num_slots), prompt)
     chosen = jnp.where(greedy | (frontier == UNKNOWN), len(state.choices), frontier)
-    # As long as searches find nothing, they become rarer; a shorter known path resets that.
+    # As long as searches find nothing better, they become rarer; a shorter known path resets that.
     patience = jnp.minimum(2 * state.patience, MOST_PATIENCE)
-    patience = jnp.where(found.sure.exists | (known < state.shortest), 1, patience)
+    surely = found.sure.exists & space.deterministic
+    patience = jnp.where(surely | (known < state.shortest), 1, patience)
     return Query(prompt, greedy), state._replace(
+        hoped=hopes,
         patience=jnp.where(wanted, patience, state.patience),
         wait=jnp.where(wanted, patience - 1, jnp.maximum(state.wait - 1, 0)),
         shortest=jnp.where(wanted, known, state.shortest),
@@ -263,11 +278,26 @@ def _update(tools: Tools, state: MapState, query: Query, episode: Episode) -> Ma
     last = steps.length - 1
     arrives = jnp.all(jnp.abs(steps.achieved_goals[last] - state.task_goal) < SAME)
     arrived = jnp.where(arrives, steps.length, FAR)
+    prompts = with_result(state.prompts, query, episode.return_)
+    counted = jnp.minimum(arrived, tools.space.horizon + 1)
+    means = jnp.where(
+        query.greedy, mean_steps(state.steps, prompts, query.prompt, counted), state.steps
+    )
+    shortest = jnp.where(query.greedy, jnp.minimum(state.verified, arrived), state.verified)
+    if not tools.space.deterministic:
+        index = jnp.argmax(estimated_returns(prompts, deterministic=False))
+        shortest = jnp.where(prompts.size > 0, jnp.ceil(means[index]).astype(jnp.int32), FAR)
+    else:
+        gained = shortest < state.verified
+        state = state._replace(
+            patience=jnp.where(gained, 1, state.patience), wait=jnp.where(gained, 0, state.wait)
+        )
     return state._replace(
         table=added,
         start=start,
-        prompts=with_result(state.prompts, query, episode.return_),
-        verified=jnp.where(query.greedy, jnp.minimum(state.verified, arrived), state.verified),
+        prompts=prompts,
+        steps=means,
+        verified=shortest,
         best_goals=choose(improves, steps.goals, state.best_goals),
         best_steps=jnp.where(improves, arrived, state.best_steps),
         best_return=jnp.maximum(state.best_return, episode.return_),

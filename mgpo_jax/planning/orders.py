@@ -149,6 +149,9 @@ def _registered(
 def next_goal(key: PRNGKeyArray, order: Order) -> Int[Array, ""]:
     """Draw the goal to try after the prefix, with a preference for goals often reached and seldom tried.
 
+    Goals that are ruled out are drawn only if all others are: then the next goal was not seen yet, and
+    episodes have to go on until it is.
+
     Returns its index, or ``NONE`` if no goal is left.
     """
     rest = (jnp.arange(MAX_GOALS) < order.size) & ~order.confirmed

@@ -203,8 +203,7 @@ def search_prompts(
         pool, led = jax.lax.switch(which, branches, pool)
         num += NUM_LED * needed
     sooner = pool.rehearsal.steps < verified
-    if space.deterministic:  # a prompt that was run before would act the same again
-        sooner &= ~jax.vmap(partial(is_tried, prompts))(pool.prompts)
+    sooner &= ~jax.vmap(partial(is_tried, prompts))(pool.prompts)
     return Found(
         memory=Memory(_rows(pool.prompts, NUM_KEPT), led, jnp.ones((), bool)),
         sure=_offer(pool, sooner & (pool.rehearsal.ends == ARRIVES)),

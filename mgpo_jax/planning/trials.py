@@ -4,7 +4,7 @@ bandits'."""
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from mgpo_jax.optimizers.arms import Arms, insert_arm, update_arm
 from mgpo_jax.prompts import Prompt
@@ -29,3 +29,33 @@ def with_result(prompts: Arms, query: Query, return_: Float[Array, ""]) -> Arms:
     updated = update_arm(prompts, jnp.argmax(same), return_)
     told = choose(jnp.any(same), updated, insert_arm(prompts, query.prompt, return_))
     return choose(query.greedy, told, prompts)
+
+
+def mean_steps(
+    means: Float[Array, "M"], prompts: Arms, prompt: Prompt, steps: Int[Array, ""]
+) -> Float[Array, "M"]:
+    """The mean numbers of steps of the prompts in the table, after one more episode.
+
+    Args:
+      means: the means before it.
+      prompts: the table, which already holds the return of the episode.
+      prompt: the prompt that was run.
+      steps: the number of steps that it took.
+    """
+    row = jnp.argmax(equal_to(prompts, prompt))
+    pulls = prompts.pulls[row]
+    before = jnp.where(pulls > 1, means[row], 0.0)
+    return means.at[row].set(before + (steps - before) / pulls)
+
+
+def most_promising(prompts: Arms) -> Prompt:
+    """The prompt with the highest upper bound on its mean return, as in UCB1.
+
+    The unit of the bound is the standard deviation of all returns in the table.
+    """
+    num = jnp.maximum(jnp.sum(prompts.pulls), 1)
+    overall = jnp.sum(prompts.pulls * prompts.mean) / num
+    between = prompts.pulls * (prompts.mean - overall) ** 2
+    std = jnp.sqrt(jnp.sum(prompts.sum_sq + between) / num)
+    bound = prompts.mean + std * jnp.sqrt(jnp.log(num) / jnp.maximum(prompts.pulls, 1))
+    return prompts.prompt(jnp.argmax(jnp.where(prompts.taken, bound, -jnp.inf)))
