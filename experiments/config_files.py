@@ -108,13 +108,19 @@ def _names(config_class: type) -> dict[str, str]:
     return found
 
 
-def _settings(values: Mapping[str, Any], given: set[str]) -> Iterator[tuple[str, Any]]:
-    """The settings in the file that were not typed, including those in groups."""
+def _settings(
+    values: Mapping[str, Any], given: set[str], group: str = ""
+) -> Iterator[tuple[str, Any]]:
+    """The settings in the file that were not typed, including those in groups.
+
+    A setting without a value (null) is left at its default, which is None. Only a hyper-parameter may have
+    another default, so None is given for it like any other value.
+    """
     for name, value in values.items():
         if name in GROUPS and isinstance(value, Mapping):
             if CHOOSER.get(name) not in given:
-                yield from _settings(value, given)
-        elif name not in OWN and name not in given and value is not None:
+                yield from _settings(value, given, name)
+        elif name not in OWN and name not in given and (value is not None or group == "hyper"):
             if isinstance(value, Mapping):
                 raise DataError(
                     f"the setting {shown(name)} in the config file must be a single value, found an "

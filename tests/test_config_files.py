@@ -38,6 +38,13 @@ def test_settings_survive_the_file(tmp_path: Path) -> None:
     assert to_json(again) == {**to_json(first), "config": str(path)}
 
 
+def test_a_hyper_parameter_without_a_value_stays_without_one(tmp_path: Path) -> None:
+    first = parse(AdaptConfig, ["--method", "ppo-careful", "--max-kl", "None"], adapt_default)
+    assert first.hyper.max_kl is None
+    again = parse(AdaptConfig, ["--config", str(written(tmp_path, first))], adapt_default)
+    assert again.hyper == first.hyper
+
+
 def test_what_is_typed_wins(tmp_path: Path) -> None:
     path = written(tmp_path, parse(AdaptConfig, ["--c", "3", "--seeds", "7"], adapt_default))
     typed = ["--config", str(path), "--seeds=1", "--c", "5", "--no-figures"]
