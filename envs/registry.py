@@ -154,6 +154,36 @@ class Encoder:
     prepare: Callable[[Any], Any] | None = None
 
 
+def imported(place: str) -> Any:
+    """The object at ``module:attribute``."""
+    module, _, attribute = place.partition(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def load(place: str, what: str) -> Any:
+    """The object at ``module:attribute``, where a user's own module may be in the current folder.
+
+    Args:
+      place: the place.
+      what: what should be there, for messages.
+
+    Raises:
+      UsageError: if there is no such object, or its module raises an error while it is imported.
+    """
+    here = os.getcwd()
+    if here not in sys.path:
+        sys.path.append(here)  # last, so that the current folder never shadows a package
+    try:
+        return imported(place)
+    except Exception as error:  # while it is imported, a user's module may raise anything
+        is_clear = isinstance(error, ImportError | AttributeError | UsageError | DataError)
+        said = str(error) if is_clear else f"{type(error).__name__}: {error}"
+        raise UsageError(
+            f"cannot load {what} {shown(place)}: {printable(said)}; give it as module:attribute of a "
+            "module that can be imported"
+        ) from error
+
+
 Record = TypeVar("Record")
 
 
@@ -244,17 +274,7 @@ class Registry(Generic[Record]):
             raise DataError(f"{where}: {error}{advice}") from None
 
     def _load(self, place: str) -> Record:
-        module, _, attribute = place.partition(":")
-        here = os.getcwd()
-        if here not in sys.path:
-            sys.path.append(here)  # last, so that the current directory never shadows a package
-        try:
-            record = getattr(importlib.import_module(module), attribute)
-        except (ImportError, AttributeError, ValueError) as error:
-            raise UsageError(
-                f"cannot load the {self.kind} {shown(place)}: {printable(str(error))}; give it as "
-                "module:attribute of a module that can be imported"
-            ) from None
+        record = load(place, f"the {self.kind}")
         if not isinstance(record, self.type):
             raise UsageError(
                 f"{place} is a {type(record).__name__}; the place of a {self.kind} must be that of a "

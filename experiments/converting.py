@@ -7,10 +7,7 @@ what action t achieved.
 
 from __future__ import annotations
 
-import importlib
 import inspect
-import os
-import sys
 from collections.abc import Callable, Mapping
 from types import SimpleNamespace
 from typing import Any
@@ -18,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from envs.errors import DataError, UsageError, printable, shown
+from envs.registry import load
 from experiments.dropped_ends import kind_of_end
 from experiments.sources import ACTIONS, TERMINATED, TRUNCATED, Source, first_of
 from experiments.store.data_settings import ImportConfig
@@ -66,13 +64,7 @@ def load_function(place: str) -> Callable[..., Any]:
     Raises:
       UsageError: if there is no such function.
     """
-    module, _, attribute = place.partition(":")
-    if (here := os.getcwd()) not in sys.path:
-        sys.path.append(here)  # last, so that the current folder never shadows a package
-    try:
-        function = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise UsageError(f"--goal {place} cannot be loaded: {printable(str(error))}") from None
+    function: Any = load(place, "--goal")
     if not callable(function):
         raise UsageError(f"--goal {place} is not a function, found {shown(function)}")
     return function

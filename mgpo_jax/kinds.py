@@ -7,13 +7,12 @@ package can add more under the entry-point group ``mgpo_jax.kinds``. Nothing her
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from envs.errors import UsageError
-from envs.registry import Registry
+from envs.registry import Registry, imported
 
 if TYPE_CHECKING:
     from envs.base import Agent
@@ -82,8 +81,7 @@ class Kind:
         """Import the functions that make up the kind."""
         if not isinstance(self.learned, str):
             return self.learned
-        module, _, attribute = self.learned.partition(":")
-        found: Learned = getattr(importlib.import_module(module), attribute)
+        found: Learned = imported(self.learned)
         return found
 
 

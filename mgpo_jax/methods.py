@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import importlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,7 +16,7 @@ import numpy as np
 from annotated_types import Ge, Gt, Le
 
 from envs.errors import DataError, UsageError
-from envs.registry import Judgement, Registry, World
+from envs.registry import Judgement, Registry, World, imported
 from mgpo_jax.kinds import MULTI_GOAL, kind_of
 from mgpo_jax.settings import (
     NotNegative,
@@ -131,10 +130,7 @@ def check_kind(found: str, method: Method) -> None:
 
 def load(place: str | Callable) -> Callable:
     """Import the function at ``module:attribute``; a function is returned unchanged."""
-    if not isinstance(place, str):
-        return place
-    module, _, attribute = place.partition(":")
-    return getattr(importlib.import_module(module), attribute)
+    return imported(place) if isinstance(place, str) else place
 
 
 def foreign_setting(name: str, method: Method) -> UsageError:

@@ -7,6 +7,7 @@ import sys
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib.metadata import EntryPoint
 from typing import NamedTuple
 
 import jax
@@ -460,6 +461,41 @@ class TestRegistry:
             envs.find("world_file_here:OTHER")
         with pytest.raises(UsageError, match="cannot load the world 'nowhere:WORLD'"):
             envs.find("nowhere:WORLD")
+
+
+class TestPlugIns:
+    """Worlds that installed packages announce by an entry point."""
+
+    @pytest.fixture
+    def announce(self, tmp_path, monkeypatch):
+        """Write a module, and announce its ``WORLD`` under a name."""
+        points = []
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
+        monkeypatch.setattr(envs.registry, "entry_points", lambda group: points)
+
+        def announce(module, name, text):
+            (tmp_path / f"{module}.py").write_text(text)
+            points.append(EntryPoint(name, f"{module}:WORLD", "mgpo_jax.worlds"))
+
+        return announce
+
+    @pytest.mark.parametrize(
+        ("text", "says"),
+        [
+            ("WORLD = undefined", "NameError: name 'undefined' is not defined"),
+            ("WORLD = ", r"SyntaxError: invalid syntax \(plug_in_\d.py, line 1\)"),
+            ("import no_such_package", "No module named 'no_such_package'"),
+        ],
+    )
+    def test_a_broken_one_disturbs_no_other(self, announce, text, says, request):
+        module = f"plug_in_{request.node.callspec.indices['text']}"
+        announce(module, "broken", text)
+        usable = [world.name for world in WORLDS.usable()]
+        assert "maze15" in usable
+        assert "broken" not in usable
+        with pytest.raises(UsageError, match=f"cannot load the world '{module}:WORLD': {says}"):
+            envs.find("broken")
 
 
 class TestUnknownNames:

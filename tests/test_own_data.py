@@ -273,7 +273,7 @@ def test_goals_by_a_function_of_observations_or_of_an_episode(monkeypatch):
             r"episode 0: --goal my_goals:few gives float32\[1, 3\], wanted .* \[4, G\]",
         ),
         ("broken", DataError, "episode 0: --goal my_goals:broken raised KeyError: 'door'"),
-        ("nothing", UsageError, "my_goals:nothing cannot be loaded: .* has no attribute"),
+        ("nothing", UsageError, "cannot load --goal 'my_goals:nothing': .* has no attribute"),
         ("NUMBER", UsageError, "my_goals:NUMBER is not a function, found 3"),
     ):
         with pytest.raises(error, match=says):
