@@ -240,7 +240,14 @@ class Registry(Generic[Record]):
         if place is None:
             raise nearest(name, self.names(), self.kind)
         if place not in self._loaded:
-            self._loaded[place] = self._load(place)
+            record = self._load(place)
+            own: str = record.name  # type: ignore[attr-defined]
+            if ":" not in name and own != name:
+                raise UsageError(
+                    f"the entry point {shown(name)} in the group {self.group} gives the {self.kind} "
+                    f"{shown(own)}; give both the same name"
+                )
+            self._loaded[place] = record
         return self._loaded[place]
 
     def known(self, name: str, where: object, flag: str = "") -> Record:

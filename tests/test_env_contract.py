@@ -497,6 +497,16 @@ class TestPlugIns:
         with pytest.raises(UsageError, match=f"cannot load the world '{module}:WORLD': {says}"):
             envs.find("broken")
 
+    def test_its_entry_point_has_its_name(self, announce):
+        announce(
+            "plug_in_maze", "mymaze", "import envs\nWORLD = envs.World(name='my-maze', make=None)"
+        )
+        with pytest.raises(
+            UsageError, match=r"entry point 'mymaze' .* the world 'my-maze'; give both"
+        ):
+            envs.find("mymaze")
+        assert not {"mymaze", "my-maze"} & {world.name for world in WORLDS.usable()}
+
 
 class TestUnknownNames:
     @pytest.mark.parametrize(("wrong", "right"), [("maze16", "maze1[56]"), ("Maze30", "maze30")])
