@@ -134,8 +134,15 @@ class Converter:
         actions = first_of(ACTIONS, arrays)
         if actions is None:
             raise DataError(f"{who} has no actions; it has {printable(', '.join(sorted(arrays)))}")
-        num, after = len(actions), first_of(NEXT, arrays)
+        num = len(actions)
+        # Arrays named by the user are others than those that go on in next_observations.
+        after = None if self.config.obs_arrays else first_of(NEXT, arrays)
         if num and len(obs) == num and after is not None and len(after) == num:
+            if after.shape[1:] != obs.shape[1:]:
+                raise DataError(
+                    f"{who}: next observations have shape {list(after.shape[1:])}, observations "
+                    f"{list(obs.shape[1:])}; both must be the same"
+                )
             obs = np.concatenate([obs, after[-1:]])
         if len(obs) == num:
             num -= 1

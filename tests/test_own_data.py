@@ -107,6 +107,24 @@ def test_an_episode_of_t_observations_loses_its_last_action():
     assert not dataset.terminated.any()  # the ends were left out
 
 
+def test_next_observations_are_not_those_of_named_arrays():
+    logs = flat(logged())
+    np.savez("logs.npz", **logs, qpos=0 * logs["observations"])
+    dataset, _, said = imported("logs.npz", goal_columns=(0,), obs_arrays=("qpos",))
+    assert "3 episodes have no observation after their last action" in said
+    assert dataset.lengths.tolist() == [2, 1, 3]
+    assert not dataset.last_obs.any()
+
+
+def test_next_observations_of_another_size_are_refused():
+    logs = flat(logged())
+    np.savez("logs.npz", **{**logs, "next_observations": logs["next_observations"][:, :2]})
+    with pytest.raises(
+        DataError, match=r"episode 0: next observations have shape \[2\], obs.* \[3\]"
+    ):
+        imported("logs.npz")
+
+
 def test_a_folder_of_episodes_is_the_same_dataset_as_flat_arrays():
     np.savez("logs.npz", **flat(logged()))
     Path("episodes").mkdir()
