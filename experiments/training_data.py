@@ -49,15 +49,18 @@ def own_dataset(config: PretrainConfig, env: Environment | None) -> tuple[Datase
         raise DataError(str(error).replace(mend_for(folder), mend)) from None
     dataset = dataset.slice(0, config.data.trajectories)
     if env is not None and dataset.task_hashes is not None:
-        refuse_test_tasks(dataset, env, envs.find(config.env), folder)
+        mend = "leave its trajectory out of your logs and import them again"
+        refuse_test_tasks(dataset, env, envs.find(config.env), folder, mend)
     return dataset, folder, manifest["sha256"]
 
 
-def refuse_test_tasks(dataset: Dataset, env: Environment, world: World, folder: Path) -> None:
-    """Raise ``DataError`` if a trajectory is of a test task."""
+def refuse_test_tasks(
+    dataset: Dataset, env: Environment, world: World, folder: Path, mend: str
+) -> None:
+    """Raise ``DataError``, with ``mend`` in its message, if a trajectory is of a test task."""
     forbidden = task_hashes(env, benchmark_tasks(env, world.num_test_tasks))
     if dataset.task_hashes is not None and np.isin(dataset.task_hashes, forbidden).any():
-        raise DataError(f"{folder} holds a test task; remove it and collect it again")
+        raise DataError(f"{folder} holds a test task; {mend}")
 
 
 def prepare_dataset(
@@ -110,7 +113,7 @@ def prepare_dataset(
             f"{folder} was collected by the demonstrator with {made_with or 'no settings'}, which now "
             f"has {settings or 'none'}; remove it, and it is collected again"
         )
-    refuse_test_tasks(dataset, env, world, folder)
+    refuse_test_tasks(dataset, env, world, folder, "remove it and collect it again")
     if config.holdout >= len(dataset):
         raise UsageError(
             f"--holdout {config.holdout} leaves nothing of {len(dataset)} trajectories"

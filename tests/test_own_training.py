@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hostile.work import Evaluation, WorkBegan, begin
 
+import envs
 from experiments import runtime, training, watching
 from experiments.networks import moments
 from experiments.parsing import parse
@@ -21,6 +22,7 @@ from mgpo_jax import Actor, Dataset, load_policy, save_dataset
 from mgpo_jax.manifest import Facts, SpecEntry, read_facts
 from mgpo_jax.policy_files import read_policy
 from mgpo_jax.settings import check_settings
+from mgpo_jax.tasks import benchmark_tasks, task_hashes
 from mgpo_jax.training import Trainer
 
 HORIZON = 12
@@ -188,22 +190,27 @@ def test_the_data_of_a_run_must_stay_what_it_was(here, capsys):
     assert pretrain(f"{more} --out first --resume") == 0
 
 
-@pytest.mark.parametrize("slow", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_with_a_world_its_shapes_and_recipe_hold(here, capsys, monkeypatch, slow):
-    """Logs of a world are watched in it, also where it has no demonstrators."""
-    monkeypatch.syspath_prepend(Path(__file__).parent)
+def doors(**more: np.ndarray) -> Dataset:
+    """Logs of the world in ``own_world``."""
     rng = np.random.default_rng(0)
     total = 20 * 5
     goals = np.eye(9, dtype=np.float32)[rng.integers(0, 9, total)]
-    dataset = Dataset(
+    return Dataset(
         obs=rng.integers(0, 2, (total, 3, 3), dtype=np.uint8),
         actions=rng.integers(0, 3, total).astype(np.int32),
         achieved_goals=goals,
         goal_reached=np.ones(total, bool),
         outcomes=goals,
         lengths=np.full(20, 5, np.int32),
+        **more,
     )
-    save_dataset(Path("doors"), dataset, {}, mapped=True)
+
+
+@pytest.mark.parametrize("slow", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_with_a_world_its_shapes_and_recipe_hold(here, capsys, monkeypatch, slow):
+    """Logs of a world are watched in it, also where it has no demonstrators."""
+    monkeypatch.syspath_prepend(Path(__file__).parent)
+    save_dataset(Path("doors"), doors(), {}, mapped=True)
     words = f"--env own_world:UNSHOWN --data doors {SIZES} {STEPS} --eval-tasks 2 --out doors-run"
     if not slow:  # as far as the first step, whose program takes long to compile
         monkeypatch.setattr(Trainer, "step", begin)
@@ -215,6 +222,17 @@ def test_with_a_world_its_shapes_and_recipe_hold(here, capsys, monkeypatch, slow
     assert "--holdout 2" in capsys.readouterr().err
     policy = load_policy("own_world:UNSHOWN", "doors-run/policy")
     assert (policy.config.horizon, policy.config.head) == (12, "categorical")
+
+
+def test_logs_of_a_test_task_are_refused_and_not_given_up(here, capsys, monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parent)
+    world = envs.find("own_world:UNSHOWN")
+    env = world.make()
+    (one,) = task_hashes(env, benchmark_tasks(env, world.num_test_tasks))[:1]
+    save_dataset(Path("doors"), doors(task_hashes=np.full(20, one)), {}, mapped=True)
+    assert pretrain("--env own_world:UNSHOWN --data doors --out doors-run") == 1
+    said = capsys.readouterr().err
+    assert "doors holds a test task; leave its trajectory out of your logs and import them" in said
 
 
 def facts(num=1000, mean=50, longest=80, **changes):
