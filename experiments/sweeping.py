@@ -86,8 +86,11 @@ def check_finished(config: AdaptConfig, policy: LoadedPolicy, tasks: Task) -> No
 
 
 def show(config: AdaptConfig) -> None:
-    """Print a table of the variants, and draw their learning curves in one figure."""
-    from experiments.drawing import write
+    """Print a table of the variants, and draw their learning curves in one figure.
+
+    A figure that was changed, or was not written by a command, is kept, with a line on stderr.
+    """
+    from experiments.drawing import is_kept, write
     from experiments.figures import later, learning_curve
     from experiments.store.result_files import load_results
     from experiments.store.rows import as_json, comparison, read_row
@@ -95,9 +98,10 @@ def show(config: AdaptConfig) -> None:
     folders = [variant.folder for variant in variants(config).values()]
     rows = [read_row(folder) for folder in folders]
     say(json.dumps([as_json(row) for row in rows], indent=2) if config.json else comparison(rows))
-    if config.figures:
+    path = config.folder / "learning_curve.png"
+    if config.figures and not is_kept(path):
         curves = {f"{config.method} ({f.name})": load_results(f, parts=()) for f in folders}
-        write(config.folder / "learning_curve.png", later(learning_curve, curves, config.env))
+        write(path, later(learning_curve, curves, config.env))
 
 
 def sweep_and_save(

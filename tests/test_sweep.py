@@ -93,7 +93,9 @@ def test_a_sweep_is_its_single_runs(
         )  # fmt: skip
         np.testing.assert_array_equal(found.returns, alone.returns)
         np.testing.assert_array_equal(found.eval_returns, alone.eval_returns)
-    assert (tmp_path / "sweep" / "learning_curve.png").is_file()
+    picture = tmp_path / "sweep" / "learning_curve.png"
+    assert picture.is_file()
+    picture.write_bytes(b"drawn by the user")
     # A scheduler may pass --resume again after the sweep has finished.
     words = (
         f"--env tiny --policy {tmp_path}/policy --tasks {tmp_path}/tasks.npz --seeds 2 --episodes 6"
@@ -103,6 +105,8 @@ def test_a_sweep_is_its_single_runs(
     said = capsys.readouterr()
     assert "is already finished" in said.err
     assert said.out == text
+    assert f"{picture} is kept: it was changed" in said.err
+    assert picture.read_bytes() == b"drawn by the user"
     for values, says in {
         "c=0,1": "holds no results of c=1",
         "c=0,5 --seed 1": "other settings",
