@@ -160,8 +160,6 @@ def adapt_and_save(
             return None
         results = results_with_summary(config, env, policy, tasks, outcome)
         write_results(work.place, results, folder, work.meta)
-    if text := far_prompts(results):
-        print(f"warning: {text}", file=sys.stderr)
     return results
 
 
@@ -194,7 +192,10 @@ def _count_idle_episodes(results: Results) -> int:
 def results_with_summary(
     config: AdaptConfig, env: Environment, policy: LoadedPolicy, tasks: Task, outcome: Outcome
 ) -> Results:
-    """The results of an outcome, with the summary that tables show."""
+    """The results of an outcome, with the summary that tables show.
+
+    Warns on stderr if optimized prompts are far from the goals that the policy was trained on.
+    """
     optimum = np.asarray(jax.jit(jax.vmap(env.optimal_return))(tasks))
     results = results_of(outcome, to_json(config), env, tasks, optimum)
     summary = summarize(
@@ -204,4 +205,7 @@ def results_with_summary(
         num_failed=outcome.num_failed,
         cpu_seconds=outcome.cpu_seconds,
     )
-    return dataclasses.replace(results, summary=summary)
+    results = dataclasses.replace(results, summary=summary)
+    if text := far_prompts(results, f"optimized prompts of {config.folder}"):
+        print(f"warning: {text}", file=sys.stderr)
+    return results

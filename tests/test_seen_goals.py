@@ -7,6 +7,7 @@ import shutil
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -20,12 +21,15 @@ from pages_js import needs_node
 
 import envs
 from envs.errors import DataError
+from experiments import adaptation
 from experiments.adapt import command as adapt_command
+from experiments.adaptation import results_with_summary
 from experiments.evaluate import command as evaluate_command
 from experiments.pages.build import SCRIPTS, Bundle
 from experiments.pages.packing import unpacked
 from experiments.pages.playground import world_data
 from experiments.pages.report import report_data
+from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.policies import far_prompts, seen_goals_of
 from experiments.store.result_files import load_results
 from experiments.store.rows import read_row
@@ -256,11 +260,26 @@ def test_commands_warn_of_goals_that_no_demonstration_reached(
     assert (
         "warning: 2 of 2 task goals lie far from all goals that the policy was trained on" in said
     )
-    assert "warning: 2 of 2 optimized prompts lie far" in said
+    assert f"warning: 2 of 2 optimized prompts of {out} lie far" in said
     with pytest.raises(SystemExit) as stop:
         evaluate_command([str(out), "--episodes", "1"])
     assert stop.value.code == 0
     assert f"warning: 2 of 2 prompts of {out} lie far" in capsys.readouterr().err
+
+
+def test_sweeps_and_comparisons_warn_like_single_adaptations(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They all make their results by the same function."""
+    found = load_results(ROOT / "results" / "maze15" / "bbt")
+    monkeypatch.setattr(adaptation, "results_of", lambda *given: found)
+    monkeypatch.setattr(adaptation, "summarize", lambda *given, **more: found.summary)
+    env: Any = SimpleNamespace(optimal_return=lambda task: 0.0)
+    policy: Any = SimpleNamespace(sha256="")
+    outcome: Any = SimpleNamespace(num_episodes=0, num_failed=0, cpu_seconds=0.0)
+    config = AdaptConfig(out=Path("sweep/c=1"))
+    results_with_summary(config, env, policy, np.zeros(2), outcome)
+    assert "optimized prompts of sweep/c=1 lie far" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["maze15", "maze30", "gridworld", "kitchen", "crafter-symbolic"])

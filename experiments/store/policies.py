@@ -68,12 +68,17 @@ def seen_goals_of(results: Results) -> SeenGoals | None:
     return None
 
 
-def far_prompts(results: Results) -> str:
-    """A warning of optimized prompts with goals far from the training; empty if there are none."""
+def far_prompts(results: Results, what: str = "optimized prompts") -> str:
+    """A warning of optimized prompts with goals far from the training; empty if there are none.
+
+    Args:
+      results: the adaptation.
+      what: what the message calls the prompts.
+    """
     if "prompt.goals" not in results.best:  # the method has no prompts
         return ""
     goals, mask = (results.best[name][:, :, -1] for name in ("prompt.goals", "prompt.mask"))
-    return warning_of_prompts(seen_goals_of(results), goals, mask, "optimized prompts")
+    return warning_of_prompts(seen_goals_of(results), goals, mask, what)
 
 
 def check_weights(results: Results, policy: LoadedPolicy, mend: str) -> None:
