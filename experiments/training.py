@@ -203,15 +203,16 @@ def _has_ended(config: PretrainConfig) -> bool:
 def _train_and_save(run: Run, go_on: str) -> None:
     """Take the steps of a training, and write checkpoints, metrics, the policy and its curve."""
     config, folder = run.config, run.folder
-    if config.data.data_folder is None and not config.resume:  # else it was printed before
-        print(schedule(config), file=sys.stderr)
     blank = run.initial_state()
-    before = _snapshot_to_resume(run, blank) or Snapshot(blank, [], [])
+    found = _snapshot_to_resume(run, blank)
+    if found is not None:
+        print(f"resuming {folder} at step {found.state.step}", file=sys.stderr)
+    elif config.data.data_folder is None:  # that of own data was printed with the recipe
+        print(schedule(config), file=sys.stderr)
+    before = found or Snapshot(blank, [], [])
     rows = before.measured
     if rows is None:  # a checkpoint of an older version
         rows = salvaged_rows(folder / METRICS, before.state.step)
-    if config.resume:
-        print(f"resuming {folder} at step {before.state.step}", file=sys.stderr)
     metrics = Metrics(folder, config, rows)
     before = before._replace(state=state_of_first(before.state, blank))
     state = _train_together(run, before, metrics, go_on)
