@@ -9,10 +9,11 @@ machine and compares ways to divide it.
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, NoReturn
+from typing import Annotated, Any, Literal, NoReturn
 
 import tyro
 
@@ -65,28 +66,22 @@ def main(config: BenchConfig) -> None:
     join(config)
     from experiments.demonstrators import find_demonstrator
     from experiments.measurements import measurements
-    from experiments.store.provenance import provenance
     from experiments.store.tables import aligned
-    from mgpo_jax.files import write_json
 
     if config.demonstrator is not None:
         find_demonstrator(envs.find(config.env), envs.make(config.env), config.demonstrator)
-    rows = []
+    rows: list[Any] = []
     num = config.trajectories or (500 if config.quick else 5_000)
-    with farewell(lambda: STOPPED):
+    with writing(config, "rows", rows):
         for row in measurements(config.env, config.demonstrator, num, config.quick, config.rows):
             rows.append(row)
             cells = (row.name, f"{row.value:>10.3f}", row.unit, row.note)
             say(aligned(cells, COLUMNS))
-    if config.json and processes.is_first():
-        write_json(config.json, {"env": config.env, "rows": rows, **provenance()})
-        print(f"results written to {config.json}", file=sys.stderr)
 
 
 def show_layouts(config: BenchConfig) -> None:
     """Measure and print the rows of the bench for each layout."""
     from experiments.store.tables import aligned
-    from mgpo_jax.files import write_json
 
     rows_wanted = "step" if config.rows == "step" else "shared"
     words = ["--env", config.env, "--rows", rows_wanted, *(["--quick"] if config.quick else [])]
@@ -94,15 +89,35 @@ def show_layouts(config: BenchConfig) -> None:
         words += ["--demonstrator", config.demonstrator]
     if config.trajectories is not None:
         words += ["--trajectories", str(config.trajectories)]
-    found = []
-    for layout in config.layouts:
-        rows = measured(layout, words)
-        found.append({"layout": layout, "rows": rows})
-        for row in rows:
-            cells = (layout, row["name"], f"{row['value']:>10.3f}", row["unit"], row["note"])
-            say(aligned(cells, (6, *COLUMNS)))
-    if config.json:
-        write_json(config.json, {"env": config.env, "layouts": found})
+    found: list[Any] = []
+    with writing(config, "layouts", found):
+        for layout in config.layouts:
+            rows = measured(layout, words)
+            found.append({"layout": layout, "rows": rows})
+            for row in rows:
+                cells = (layout, row["name"], f"{row['value']:>10.3f}", row["unit"], row["note"])
+                say(aligned(cells, (6, *COLUMNS)))
+
+
+@contextmanager
+def writing(config: BenchConfig, name: str, found: list[Any]) -> Iterator[None]:
+    """Write what was found to the JSON file, under a name, after the block or when a signal ends it."""
+    from experiments.store.provenance import provenance
+    from mgpo_jax.files import write_json
+
+    def write() -> None:
+        if config.json and processes.is_first():
+            write_json(config.json, {"env": config.env, name: found, **provenance()})
+            print(f"results written to {config.json}", file=sys.stderr)
+
+    def stopped() -> str:
+        if found:
+            write()
+        return STOPPED
+
+    with farewell(stopped):
+        yield
+    write()
 
 
 def command(argv: Sequence[str] | None = None) -> NoReturn:

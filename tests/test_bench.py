@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,7 +19,7 @@ import pytest
 
 import envs
 from envs.errors import DataError, UsageError
-from experiments import layouts, measurements
+from experiments import bench, layouts, measurements, signals
 from experiments.bench import BenchConfig, main
 from experiments.measurements import sequence_flops
 from experiments.store.presets import pretrain_preset
@@ -102,6 +103,36 @@ def test_rows_of_baselines_are_per_episode_of_the_search(monkeypatch: pytest.Mon
     assert rows[0].note == "made, 4 tasks x 40 episodes of 30 steps"
     assert [kind for kind, *_ in asked] == ["mgpo", "mgpo", "ptgm", "spirl"]
     assert {tuple(rest) for _, _, *rest in asked} == {(1, 40, 40)}
+
+
+@pytest.mark.parametrize("kind", ["rows", "layouts"])
+def test_a_bench_that_is_stopped_keeps_its_measurements(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, kept = tmp_path / "bench.json", []
+    row: dict[str, Any] = {"name": "collection", "value": 1.0, "unit": "ms", "note": ""}
+
+    def stop() -> None:
+        assert signals._watch.farewell() == bench.STOPPED
+        kept.append(len(json.loads(path.read_text())[kind]))
+
+    def measure(*given: Any) -> Iterator[measurements.Row]:
+        for _ in range(2):
+            yield measurements.Row(**row)
+            stop()
+
+    def measure_layout(layout: str, words: Any) -> list[dict[str, Any]]:
+        if layout == "1x2":
+            stop()
+        return [row]
+
+    monkeypatch.setattr(measurements, "measurements", measure)
+    monkeypatch.setattr(bench, "measured", measure_layout)
+    main(BenchConfig(json=path, layouts=("2x1", "1x2") if kind == "layouts" else ()))
+    assert kept == ([1] if kind == "layouts" else [1, 2])
+    found = json.loads(path.read_text())
+    assert len(found[kind]) == 2
+    assert {"revision", "command"} <= found.keys()
 
 
 def test_a_bench_that_is_stopped_leaves_no_process_and_no_folder(
