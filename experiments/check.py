@@ -17,7 +17,7 @@ from typing import Any, NoReturn
 import tyro
 
 import envs
-from envs.errors import DataError, UsageError
+from envs.errors import DataError, UsageError, nearest
 from experiments.runtime import Common, refuse_existing_file, run, say
 from experiments.signals import farewell
 from mgpo_jax.settings import Name
@@ -63,6 +63,10 @@ def named_worlds(config: CheckConfig) -> list[str]:
     Raises:
       UsageError: for an unknown world, or a mixture of worlds and result folders.
     """
+    for path in config.runs:
+        # A path with folders in it is no mistyped world.
+        if not (os.path.lexists(path) or is_world(str(path)) or len(path.parts) > 1):
+            raise nearest(str(path), envs.names(), "folder or world")
     names = [str(path) for path in config.runs if not os.path.lexists(path) and is_world(str(path))]
     if names and len(names) < len(config.runs):
         raise UsageError("give worlds to check, or result folders to compare, not both at once")
@@ -99,6 +103,7 @@ def check(names: Sequence[str], out: Path | None, as_json: bool = False) -> None
         say(json.dumps({"worlds": found}, indent=2))
     if out:
         write_json(out, {"worlds": found, **provenance()})
+        print(f"results written to {out}", file=sys.stderr)
     broken = [name for name, report in reports.items() if report.faults]
     if broken:
         raise DataError(

@@ -400,8 +400,9 @@ def command(
 
 
 def test_the_command_checks_worlds(command) -> None:
-    code, out, _ = command("own_world:WORLD --out new.json")
+    code, out, err = command("own_world:WORLD --out new.json")
     assert code == 0
+    assert err.endswith("results written to new.json\n")
     assert out.startswith("line: no faults\n")
     found = json.loads(Path("new.json").read_text())["worlds"]["own_world:WORLD"]
     assert found["faults"] == []
@@ -420,6 +421,9 @@ BAD = World(name="bad-track", make=told(lambda s, t, a: {"reward": 3 * t.reward}
         ("", "no result folder given, and no world"),
         ("nowhere:WORLD", "cannot load the world 'nowhere:WORLD'"),
         ("maze15 . ", "not both at once"),
+        ("maze51", "unknown folder or world 'maze51'; did you mean 'maze15'?"),
+        ("maze15 maze51", "unknown folder or world 'maze51'"),
+        ("maze15 runs/maze51", "not both at once"),
         ("maze15 --env maze30", "leave them out to check a world"),
         ("maze15 --out .", "--out"),
     ],
