@@ -47,6 +47,10 @@ class Judgement:
         return self.mode == "sample" and self.temperature != 1
 
     def __post_init__(self) -> None:
+        if self.mode not in ("greedy", "sample"):
+            raise UsageError(
+                f"the mode of a Judgement must be greedy or sample, found {shown(self.mode)}"
+            )
         if not (0 < self.temperature < math.inf and self.episodes >= 1):
             raise UsageError(
                 "a Judgement needs a finite temperature above 0 and at least one episode, found "

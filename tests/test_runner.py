@@ -581,6 +581,15 @@ def test_judgements_that_say_nothing(changes):
         Judgement("sample", **changes)
 
 
+def test_judgements_have_one_of_two_modes():
+    judged = Judgement()
+    object.__setattr__(
+        judged, "mode", "sampled"
+    )  # tests check types of arguments, users' programs do not
+    with pytest.raises(UsageError, match="must be greedy or sample, found 'sampled'"):
+        judged.__post_init__()
+
+
 def test_uncertainty_is_that_of_the_steps_of_the_episode(tasks):
     """Step by step, with the policy's own decoding, along the episodes that the runner plays."""
     policy, num = untrained(MAZE), len(tasks.goal)
