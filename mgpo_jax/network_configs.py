@@ -124,9 +124,12 @@ def network_config(spec: EnvSpec, head: str | None = None, **sizes: Any) -> Tran
     """The network config for a world, with the sizes of Table 6 except for those given.
 
     Raises:
-      UsageError: see ``world_side``.
+      UsageError: if ``sizes`` holds what follows from the world; see also ``world_side``.
     """
-    return TransformerConfig(**world_side(spec, head, sizes.get("encoder", "linear")), **sizes)
+    from_world = world_side(spec, head, sizes.get("encoder", "linear"))
+    for name in sizes.keys() & from_world.keys():
+        raise UsageError(f"{name} of a network follows from the world {spec.name}; leave it out")
+    return TransformerConfig(**from_world, **sizes)
 
 
 def world_side(spec: EnvSpec, head: str | None, encoder: str) -> dict[str, Any]:

@@ -571,6 +571,8 @@ def test_a_library_call_says_what_does_not_fit(toy: Any) -> None:
             UsageError, match="unknown setting of the network 'embed_dmi'; did you mean"
         ):
             pretrain(dataset, SPEC, TRAIN, init, embed_dmi=16)
+    with pytest.raises(UsageError, match="horizon of a network follows from the world toy; leave"):
+        pretrain(dataset, SPEC, TRAIN, horizon=5)
     with pytest.raises(UsageError, match="num_heads must divide embed_dim 10, found 4"):
         pretrain(dataset, SPEC, TRAIN, embed_dim=10)
     with pytest.raises(UsageError, match=r"num.layers must be at least 1, found 0"):
