@@ -190,6 +190,10 @@ def network_fault(config: NetworkConfig) -> str | None:
     for name in ("obs_mean", "obs_std"):
         if len(getattr(config, name)) not in (0, size):
             return f"{name} must hold {size} numbers or none, found {len(getattr(config, name))}"
+    if (num := len(config.obs_std)) != len(config.obs_mean):
+        return (
+            f"obs_std must hold as many numbers as obs_mean, found {num} and {len(config.obs_mean)}"
+        )
     return _layout_fault(config)
 
 

@@ -106,6 +106,7 @@ def test_standardization_comes_back(tmp_path: Path, params: dict) -> None:
     ("change", "says"),
     [
         ({"obs_mean": [0.0] * 4}, "network.obs_mean must hold 6 numbers or none, found 4"),
+        ({"obs_mean": [0.0] * 6}, "network.obs_std must hold as many numbers as obs_mean, found 0"),
         ({"obs_mean": 1.0}, "network.obs_mean must be a list, found 1.0"),
         ({"obs_std": [float("nan")] * 6}, r"network.obs_std must be a finite number, found \[nan"),
         ({"obs_std": [0.0] * 6}, "network.obs_std.0 must be above 0, found 0.0"),
