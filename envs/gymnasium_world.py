@@ -287,7 +287,7 @@ class GymnasiumWorld:
 
     def goal_of(self, moment: Moment) -> np.ndarray:
         """The goal of a task, given the moment after its reset."""
-        return self._goal(moment, "desired")
+        return self._goal(moment, "desired").copy()  # environments may reuse their arrays
 
     def _goal(self, moment: Moment, which: str) -> np.ndarray:
         function, key = getattr(self, which), f"{which}_goal"

@@ -231,8 +231,8 @@ def _draw_tasks(
         seed = int(seeds[index])
         options = described.drawn_options(seed)
         start = Start(seed, tuple(jax.tree.leaves(options)))
-        _, moment, _ = pool.begin(start)
-        return described.goal_of(moment), options
+        _, goal, _ = pool.begin(start, described.goal_of)
+        return goal, options
 
     drawn = pool.map(draw, len(seeds))
     return jax.tree.map(lambda *rows: np.stack(rows), *drawn)

@@ -113,10 +113,24 @@ class Pool:
         self._threads = ThreadPoolExecutor(self.num_threads) if self.num_threads > 1 else None
         self.num_made, self.num_replayed = len(self._idle), 0
 
-    def begin(self, start: Start) -> tuple[bytes, Moment, Reading]:
-        """Begin an episode; returns its identity, its first moment and the reading of that moment."""
+    def begin(
+        self, start: Start, look: Callable[[Moment], Any] = lambda moment: None
+    ) -> tuple[bytes, Any, Reading]:
+        """Begin an episode.
+
+        Args:
+          start: how it begins.
+          look: is called with its first moment, while no other thread can use the environment.
+
+        Returns:
+          Its identity, what ``look`` returned, and the reading of its first moment.
+        """
         live, reading = self._fresh(start)
-        found = live.identity, live.moment, reading
+        try:
+            found = live.identity, look(live.moment), reading
+        except BaseException:
+            self._release(live.env)
+            raise
         self._put(live)
         return found
 

@@ -25,7 +25,7 @@ import mgpo_jax
 from envs.episodes import replay, run_episode
 from envs.errors import DataError, NotAvailableError, UsageError
 from envs.gymnasium_world import GymnasiumWorld
-from envs.live import Pool, Start
+from envs.live import Moment, Pool, Start
 from experiments import runtime
 from mgpo_jax.network_configs import network_config
 from mgpo_jax.prompts import single_goal
@@ -159,8 +159,8 @@ def test_the_environments_of_a_vector_environment_are_used_one_by_one(mode: str)
         moves = rng.uniform(-1, 1, (5, 12, 2)).astype(np.float32)
         told = []
         for start, actions in zip(starts, moves, strict=True):
-            identity, moment, reading = pool.begin(start)
-            assert type(moment.env) in (Plane, Closable)
+            identity, kind, reading = pool.begin(start, lambda moment: type(moment.env))
+            assert kind in (Plane, Closable)
             gc.collect()
             for step in range(12):
                 told.append((identity, *map(bytes, reading)))
@@ -219,6 +219,34 @@ def test_what_was_told_stays_as_it_was() -> None:
     moves = np.full((1, 2), 0.5, np.float32)
     described.pool.advance(start, first, moves[:0], moves[0])
     np.testing.assert_array_equal(reading.obs, kept)
+
+
+class OneGoal(Plane):
+    """Writes its goals into one array of float32."""
+
+    def look(self):
+        seen = super().look()
+        if not hasattr(self, "aim"):
+            self.aim = np.zeros(2, np.float32)
+        self.aim[:] = seen["desired_goal"]
+        return {**seen, "desired_goal": self.aim}
+
+
+def test_goals_are_read_before_others_may_use_the_environment() -> None:
+    are_shared = []
+
+    def desired(moment: Moment) -> np.ndarray:
+        lives = described.pool._live.values()
+        are_shared.append(any(live.env is moment.env for live in lives))
+        return moment.obs["desired_goal"]
+
+    described = fresh(PLANE, make=OneGoal, most=1, desired=desired)
+    env = described.environment()
+    tasks = jax.vmap(env.sample_task)(jax.random.split(jax.random.key(0), 2))
+    assert are_shared
+    assert not any(are_shared)
+    first, second = np.asarray(jax.vmap(env.task_goal)(tasks))
+    assert (first != second).any()
 
 
 class Forgetful(Plane):
@@ -325,7 +353,7 @@ def test_what_cannot_be_a_world(changes, says) -> None:
 
 def test_a_pool_needs_no_world() -> None:
     pool = Pool(PLANE.make, PLANE.reset, PLANE.step, PLANE.read, most=2)
-    first, moment, reading = pool.begin(Start(1, ()))
+    first, moment, reading = pool.begin(Start(1, ()), lambda moment: moment)
     assert len(first) == 8
     np.testing.assert_allclose(reading.obs, moment.obs["observation"].astype(np.float32))
 
