@@ -276,11 +276,22 @@ def explained(error: BaseException, config: Any = None) -> str:
 
 
 def _flag_of(config: Any, path: Any) -> str:
-    """The flag whose value a path begins with, as ``OUT.partial`` does; empty if there is none."""
-    for name, value in (vars(config) if config is not None else {}).items():
-        if isinstance(value, Path) and str(path).startswith(str(value)):
-            return f"{flag(name)}: "
-    return ""
+    """The flag whose value a path lies in or is named after, as ``OUT/x`` or ``OUT.partial``; empty if
+    there is none."""
+    if not isinstance(path, str):
+        return ""
+    named = [
+        (len(value.parts), name)
+        for name, value in (vars(config) if config is not None else {}).items()
+        if isinstance(value, Path) and _belongs(Path(path), value)
+    ]
+    return f"{flag(max(named)[-1])}: " if named else ""
+
+
+def _belongs(path: Path, value: Path) -> bool:
+    """Whether a path is a value, lies below it, or is made beside it, as ``OUT.partial`` is."""
+    is_beside = path.parent == value.parent and path.name.startswith(f"{value.name}.")
+    return is_beside or path.is_relative_to(value)
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import json
 import os
@@ -27,6 +28,7 @@ from envs.registry import WORLDS
 from experiments import pretrain, runtime, training
 from experiments.__main__ import COMMANDS
 from experiments.parsing import parse
+from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.presets import pretrain_default, pretrain_preset
 from experiments.store.settings import PretrainConfig
 from mgpo_jax import methods
@@ -737,3 +739,20 @@ def test_the_first_command_says_that_it_compiles(
     (tmp_path / "cache" / "program").touch()
     runtime.expect_compiling()
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("policy", "name", "flag"),
+    [
+        ("a", "a" * 300, "--out: "),
+        ("a", "a" * 300 + ".partial", "--out: "),
+        (".", "a" * 300, "--out: "),
+        ("a", "a" * 300 + "/deep", "--out: "),
+        ("b" * 300, "b" * 300 + "/config.json", "--policy: "),
+        ("a", "ab", ""),
+    ],
+)
+def test_a_name_that_is_too_long_is_of_the_right_flag(policy: str, name: str, flag: str) -> None:
+    config = AdaptConfig(policy=Path(policy), out=Path("a" * 300))
+    error = OSError(errno.ENAMETOOLONG, "File name too long", name)
+    assert runtime.explained(error, config).startswith(f"{flag}the name '{name[:2]}")
