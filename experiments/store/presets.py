@@ -1,7 +1,8 @@
 """Presets of pre-training, the defaults that they imply, and which settings contradict each other.
 
-``fast`` is our recipe, which trains on two cores in ten minutes to two hours; ``paper`` has the paper's
-values (Table 6, or its code's where the text is silent); ``smoke`` only shows that everything runs.
+``fast`` is our recipe, which takes 22 minutes to 6 hours of CPU time, depending on the world; ``paper``
+has the paper's values (Table 6, or its code's where the text is silent); ``smoke`` only shows that
+everything runs.
 Settings that differ between worlds are in their ``World`` records. Nothing here imports jax.
 """
 
