@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NoReturn
+from typing import NoReturn
 
 from envs.errors import UsageError, printable
 from experiments.runtime import Common, refuse_existing_file, run
@@ -22,8 +22,6 @@ class ExportConfig(Common):
     """The world of the policy, by name or as module:attribute."""
     policy: Path | None = None
     """Folder of the policy (default: the world's released policy)."""
-    format: Literal["onnx"] = "onnx"
-    """Output format: two ONNX models."""
     out: Path = Path("policy.onnx")
     """Output file of the model of one step; the model that reads the prompt is written to
     NAME_prefill.onnx beside it."""

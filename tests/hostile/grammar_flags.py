@@ -185,7 +185,6 @@ CONTRADICTIONS: dict[str, tuple[tuple[str, str], ...]] = {
     "export": (
         ("--env gridworld", "policy"),
         ("--policy result", "result"),
-        ("--format torch", "--format"),
         ("--out new.txt", "--out"),
         ("--out nowhere/new.onnx", "nowhere"),
     ),
@@ -245,7 +244,7 @@ VALID: dict[str, tuple[str, ...]] = {
     "plot": ("--tasks 0", "--tasks 1 0", "--seed 0"),
     "report": ("result result/", "--env maze15"),
     "playground": ("--env=maze15", "--env maze15 maze15", "--env envs.maze:MAZE15"),
-    "export": ("--env=maze15", "--env envs.maze:MAZE15", "--format onnx"),
+    "export": ("--env=maze15", "--env envs.maze:MAZE15"),
     "reproduce": ("table5 --only astar4", "--seeds 2", "figure8 --only 5 10"),
     "bench": ("--demonstrator astar4", "--trajectories 3"),
 }
