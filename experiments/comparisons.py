@@ -1,8 +1,9 @@
 """The paper's comparisons of methods in several worlds (Tables 1, 2 and 8; Figures 6 and 7), cell by cell.
 
 A cell is one adaptation, which has its own folder and can be resumed on its own. Published results under
-``results/`` are used if they were made with the same weights, tasks and settings. Table 3
-(``experiments.robustness``) has the same cells.
+``results/`` are used if they were made with the same weights, tasks and settings; those of fewer seeds are
+used until the cell is made with all of them, and a note says so. Table 3 (``experiments.robustness``) has
+the same cells.
 """
 
 from __future__ import annotations
@@ -187,12 +188,12 @@ def _trained_policy(config: ReproduceConfig, world: str, method: str) -> Path:
 
 
 def made(config: ReproduceConfig, world: str, method: str) -> Cell:
-    """Get a cell: from published or earlier results, or by adapting now.
+    """Get a cell: from earlier or published results, or by adapting now.
 
     If the world is not installed or its policy is not released, the cell is empty.
     """
     settings = cell_config(config, world, method)
-    if (place := published(config, settings)) is not None:
+    if not settings.folder.is_dir() and (place := published(config, settings)) is not None:
         return Cell(world, method, place)
     try:
         record, env = envs.find(world), envs.make(world)
@@ -223,7 +224,10 @@ def _train(folder: Path, world: str, kind: str) -> None:
 
 
 def published(config: ReproduceConfig, settings: AdaptConfig) -> Path | None:
-    """The folder of published results with the settings of a cell; None if there are none."""
+    """The folder of published results with the settings of a cell; None if there are none.
+
+    They may be of fewer seeds, and of any number of episodes if the method learns nothing.
+    """
     folder = PUBLISHED / file_name(settings.env) / file_name(settings.method)
     if config.scale != "cpu" or not folder.is_dir():
         return None
@@ -232,9 +236,9 @@ def published(config: ReproduceConfig, settings: AdaptConfig) -> Path | None:
     except DataError as error:
         print(f"ignoring {folder}: {error}", file=sys.stderr)
         return None
-    summary = row.summary
-    size = (summary["num_seeds"], summary["num_episodes"])
-    same = row.tasks == "test" and size == (settings.seeds, settings.episodes)
+    learns = methods.find(settings.method).learns
+    enough = not learns or row.summary["num_episodes"] == settings.episodes
+    same = row.tasks == "test" and enough and row.summary["num_seeds"] <= settings.seeds
     return folder if same and not row.settings.keys() - {"eval_every"} else None
 
 
@@ -303,7 +307,7 @@ def _row(cell: Cell, scale: str, notes: Notes) -> list[str]:
     elif size[1] < 3:
         notes.add(f"{cell.world}, {title}: {size[1]} seed(s), where the paper has 3.")
     if not methods.find(cell.method).learns:
-        notes.add(f"{title} learns nothing, so that its budget is one episode.")
+        notes.add(f"{title} learns nothing, so the number of its episodes does not matter.")
     return [
         cell.world,
         title,

@@ -31,6 +31,7 @@ from experiments.store.speeds import (
     rate_of,
     shipped_rates,
 )
+from experiments.store.summary import read_summary
 from experiments.store.tables import table
 from mgpo_jax import methods
 from mgpo_jax.methods import Method
@@ -54,6 +55,8 @@ class Piece(NamedTuple):
     """CPU time that it took or would take; None if it cannot be estimated."""
     counts: bool = True
     """Whether it counts as a cell of the table; trainings only add to the cost."""
+    fewer: bool = False
+    """Whether it is a published cell of fewer seeds than asked for."""
 
 
 def jobs(config: ReproduceConfig) -> list[ReproduceConfig]:
@@ -103,8 +106,10 @@ def told(pieces: Sequence[Piece]) -> tuple[str, str, str]:
     known = [seconds for seconds in missing if seconds is not None]
     estimate = [f"{sum(known) / 60:.1f}"] if known else []
     estimate += ["?"] if len(known) < len(missing) else []
-    have = sum(piece.there for piece in cells)
-    return f"{have} of {len(cells)}", f"{spent:.1f}", " + ".join(estimate)
+    done = f"{sum(piece.there for piece in cells)} of {len(cells)}"
+    if fewer := sum(piece.fewer for piece in cells):
+        done += f", {fewer} with fewer seeds"
+    return done, f"{spent:.1f}", " + ".join(estimate)
 
 
 def pieces_of(config: ReproduceConfig, world: str) -> Iterator[Piece]:
@@ -130,7 +135,8 @@ def _cell(config: ReproduceConfig, world: str, method: str) -> tuple[Cell, Piece
     settings = cell_config(config, world, method)
     folder = settings.folder if settings.folder.is_dir() else published(config, settings)
     if folder is not None:
-        piece = Piece(True, cpu_seconds_of(folder))
+        fewer = read_summary(folder)["num_seeds"] < settings.seeds
+        piece = Piece(True, cpu_seconds_of(folder), fewer=fewer)
     elif settings.policy is not None and not runs.is_finished(settings.policy.parent):
         piece = Piece(False, None)  # the cost of training its policy is unknown
     else:

@@ -177,9 +177,34 @@ def test_published_cells_are_used_if_they_are_the_same(
     settings = comparisons.cell_config(config, "maze15", "ucb")
     assert comparisons.published(config, settings) == Path("results/maze15/ucb")
     assert comparisons.published(config, replace(settings, seeds=2)) is None
+    assert comparisons.published(config, replace(settings, seeds=5)) == Path("results/maze15/ucb")
+    assert comparisons.published(config, replace(settings, episodes=50)) is None
+    for world, method in (("maze30", "ppo"), ("maze15", "ptgm-random")):  # one seed; learns nothing
+        cell = comparisons.cell_config(config, world, method)
+        assert comparisons.published(config, cell) == Path("results", world, method)
     assert comparisons.published(replace(config, scale="paper"), settings) is None
     monkeypatch.chdir(tmp_path)
     assert comparisons.published(config, settings) is None
+
+
+def test_a_published_cell_of_fewer_seeds_stands_until_there_is_one_of_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(*args: Any, **options: Any) -> None:
+        raise AssertionError("what is published was done again")
+
+    monkeypatch.setattr(comparisons, "adapt_and_save", never)
+    config = ReproduceConfig(what="table8", out=tmp_path)
+    cell = comparisons.made(config, "maze30", "ppo")
+    assert cell.results == Path("results/maze30/ppo")
+    assert (
+        "- maze30, BC-finetune (PPO): 1 seed(s), where the paper has 3.\n"
+        in comparisons.as_table([cell])
+    )
+    with_all = comparisons.cell_config(config, "maze30", "ppo").folder
+    shutil.copytree("results/maze30/ppo", with_all)
+    monkeypatch.setattr(comparisons, "finished", lambda *_: None)
+    assert comparisons.made(config, "maze30", "ppo").results == with_all
 
 
 def test_figures_are_drawn_of_published_results(
@@ -367,18 +392,21 @@ def test_the_inventory_counts_prices_and_doubts(tmp_path: Path) -> None:
     rows = rows_of("maze15")
     assert rows["table2"][:2] == ["maze15", "6 of 6"]  # all published
     assert rows["table2"][3] == ""
-    assert rows["table1"][1] == "6 of 11"  # all that learn; the others act for next to nothing
+    assert (
+        rows["table1"][1] == "10 of 11"
+    )  # all but the policy itself, which acts for next to nothing
     assert float(rows["table1"][3]) < 1
     # Of PTGM nothing is published in the larger mazes that tells a price.
     larger = rows_of("maze30")["table1"]
     assert re.fullmatch(r"\d+\.\d \+ \?", larger[3])
-    # PPO and REINFORCE have one published seed each. They price three seeds of PPO and of its careful form.
+    assert larger[1] == "4 of 11, 1 with fewer seeds"
+    # PPO and REINFORCE have one published seed each. They price three seeds of the careful form.
     ppo, reinforce = (
         read_summary(Path("results/maze30", name))["cpu_seconds"] / 60
         for name in ("ppo", "reinforce")
     )
-    both = 3 * ppo + 3 * (ppo + reinforce) / 2
-    assert both < float(larger[3].split()[0]) < both + 1
+    careful = 3 * (ppo + reinforce) / 2
+    assert careful < float(larger[3].split()[0]) < careful + 1
     spent = read_summary(Path("results/maze15/ucb"))["cpu_seconds"]
     assert rows["figure3"][1:3] == ["1 of 1", f"{spent / 60:.1f}"]
     assert rows["table3"][1] == "0 of 35"
