@@ -66,7 +66,8 @@ class Kind:
       learned: the functions that make it up, or their place as ``module:attribute``.
       title: its name in the title of a model card.
       watched: a description of the agent whose returns are monitored during training.
-      preset: settings in which it differs from the world's presets, by name.
+      preset: settings in which it differs from the presets of all worlds, by name; only the preset
+        ``smoke`` may replace them.
       summary: a one-line description.
     """
 
@@ -106,7 +107,14 @@ SKILLS = Kind(
     title="Skills of SPiRL",
     watched="skills drawn from the prior",
     summary="the low level of SPiRL: skills of ten steps in a latent space, with a prior",
-    preset={"optimizer": "adamw", "learning_rate": 1e-3, "batch_size": 64, "steps": 6_000},
+    preset={  # the learning rate is that of Table 9
+        "optimizer": "adamw",
+        "learning_rate": 1e-3,
+        "warmup_steps": 300,
+        "schedule": "cosine",
+        "clip_norm": 1.0,
+        "steps": 8_000,
+    },
 )
 
 KINDS: Registry[Kind] = Registry(

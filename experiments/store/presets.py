@@ -83,11 +83,14 @@ def pretrain_preset(env: str, preset: str, method: str = MULTI_GOAL) -> Pretrain
     smoke = preset == "smoke"
     if smoke or not own:  # start from the world's fast preset
         config = with_settings(config, world.presets.get("fast", {}))
-    config = with_settings(config, kind.preset)
+    if smoke:
+        config = with_settings(config, kind.preset)
     config = with_settings(config, PRESETS[preset])
     if smoke:  # fewer padded lengths mean fewer compilations
         config = with_settings(config, {"bucket": 8 * config.train.bucket})
-    return with_settings(config, own)
+    config = with_settings(config, own)
+    # A world's recipe is for the multi-goal policy, so what a kind says of itself is worth more.
+    return config if smoke else with_settings(config, kind.preset)
 
 
 def pretrain_default(config: PretrainConfig, flags: Iterable[str] = ()) -> PretrainConfig:
