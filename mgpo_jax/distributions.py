@@ -1,7 +1,8 @@
 """Action distributions, the outputs of a policy, behind one interface.
 
 An action head outputs ``head.num_params(action_dim)`` numbers; ``head.make(params)`` turns them into a
-distribution with ``log_prob``, ``sample``, ``mode``, ``explore``, ``tempered``, ``entropy`` and ``kl``.
+distribution with ``log_prob``, ``log_prob_of_sample``, ``sample``, ``mode``, ``explore``, ``tempered``,
+``entropy`` and ``kl``.
 """
 
 from __future__ import annotations
@@ -21,6 +22,17 @@ class Distribution(Protocol):
     """A distribution over one action; leading axes of its parameters are batch axes."""
 
     def log_prob(self, action: Array) -> Float[Array, "*batch"]: ...
+
+    def log_prob_of_sample(self, action: Array) -> Float[Array, "*batch"]:
+        """The log-likelihood of an action that ``sample`` returned, as a policy gradient needs it.
+
+        It differs from ``log_prob`` where samples are clipped: a clipped action stands for all values
+        beyond its bound. The expectation of its gradient is 0, which that of ``log_prob`` is not.
+
+        Raises:
+          NotAvailableError: if there is no closed form.
+        """
+        ...
 
     def sample(self, key: PRNGKeyArray) -> Array: ...
 
@@ -64,6 +76,9 @@ class Categorical(NamedTuple):
         one_hot = jax.nn.one_hot(action, self.logits.shape[-1])
         return jnp.sum(jax.nn.log_softmax(self.logits) * one_hot, axis=-1)
 
+    def log_prob_of_sample(self, action: Int[Array, "*batch"]) -> Float[Array, "*batch"]:
+        return self.log_prob(action)
+
     def sample(self, key: PRNGKeyArray) -> Int[Array, "*batch"]:
         return jax.random.categorical(key, self.logits)
 
@@ -97,6 +112,12 @@ class Gaussian(NamedTuple):
 
     def log_prob(self, action: Float[Array, "*batch A"]) -> Float[Array, "*batch"]:
         return jax.scipy.stats.norm.logpdf(action, self.mean, jnp.exp(self.log_std)).sum(axis=-1)
+
+    def log_prob_of_sample(self, action: Float[Array, "*batch A"]) -> Float[Array, "*batch"]:
+        std = jnp.exp(self.log_std)
+        inside = jax.scipy.stats.norm.logpdf(action, self.mean, std)
+        beyond = jax.scipy.stats.norm.logcdf((jnp.sign(action) * self.mean - 1) / std)
+        return jnp.sum(jnp.where(jnp.abs(action) < 1, inside, beyond), axis=-1)
 
     def sample(self, key: PRNGKeyArray) -> Float[Array, "*batch A"]:
         noise = jax.random.normal(key, self.mean.shape)
@@ -135,6 +156,9 @@ class Mixture(NamedTuple):
         action = jnp.broadcast_to(action[..., None, :], self.mean.shape)
         of_components = Gaussian(self.mean, self.log_std).log_prob(action)
         return jax.nn.logsumexp(jax.nn.log_softmax(self.logits) + of_components, axis=-1)
+
+    def log_prob_of_sample(self, action: Float[Array, "*batch A"]) -> Float[Array, "*batch"]:
+        raise NotAvailableError("a mixture explores without the noise of its components")
 
     def sample(self, key: PRNGKeyArray) -> Float[Array, "*batch A"]:
         key_which, key_action = jax.random.split(key)
@@ -185,6 +209,9 @@ class Binned(NamedTuple):
         intervals = self.logits.shape[-1] - 1
         nearest = jnp.round((jnp.clip(action, -1.0, 1.0) + 1) / 2 * intervals).astype(jnp.int32)
         return jnp.sum(Categorical(self.logits).log_prob(nearest) + jnp.log(intervals / 2), axis=-1)
+
+    def log_prob_of_sample(self, action: Float[Array, "*batch A"]) -> Float[Array, "*batch"]:
+        return self.log_prob(action)  # a clipped sample is rounded to the value that was drawn
 
     def sample(self, key: PRNGKeyArray) -> Float[Array, "*batch A"]:
         key_value, key_around = jax.random.split(key)

@@ -69,6 +69,35 @@ def test_gaussian_samples_are_clipped_normal():
         assert stats.kstest(inside, stats.truncnorm(low, high, mean, std).cdf).pvalue > 1e-3
 
 
+def test_clipped_samples_have_the_likelihood_of_all_values_beyond_the_bound():
+    distribution = Gaussian(jnp.asarray(MEAN), jnp.asarray(LOG_STD))
+    truth = stats.norm(MEAN.astype(np.float64), np.exp(LOG_STD.astype(np.float64)))
+    for action, expected in (
+        ([0.3, -0.1], truth.logpdf([0.3, -0.1]).sum()),
+        ([1.0, -0.1], truth.logsf(1)[0] + truth.logpdf(-0.1)[1]),
+        ([0.3, -1.0], truth.logpdf(0.3)[0] + truth.logcdf(-1)[1]),
+    ):
+        found = distribution.log_prob_of_sample(jnp.array(action))
+        np.testing.assert_allclose(found, expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("head", ["categorical", "binned", "gaussian", "fixed_gaussian"])
+def test_the_mean_of_the_score_is_zero(head):
+    """So a policy gradient goes nowhere if all returns are the same, even if most samples are clipped."""
+    num, num_samples = HEADS[head].num_params(2), 20_000
+    params = 1.5 + 0.2 * jax.random.normal(jax.random.key(3), (num,))
+
+    @jax.jit
+    @jax.vmap
+    def score(key):
+        action = HEADS[head].make(params).sample(key)
+        return jax.grad(lambda p: HEADS[head].make(p).log_prob_of_sample(action))(params)
+
+    scores = np.asarray(score(jax.random.split(jax.random.key(4), num_samples)))
+    errors = scores.std(axis=0) / num_samples**0.5
+    assert (abs(scores.mean(axis=0)) <= 4 * errors).all()
+
+
 def test_gaussian_mode_is_its_mean():
     np.testing.assert_array_equal(Gaussian(jnp.asarray(MEAN), jnp.asarray(LOG_STD)).mode(), MEAN)
 

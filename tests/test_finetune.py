@@ -188,6 +188,8 @@ def test_mixtures_have_no_divergence_and_are_refused() -> None:
     mixture = HEADS["mixture"].make(jnp.zeros(HEADS["mixture"].num_params(2)))
     with pytest.raises(NotAvailableError, match="no closed form"):
         mixture.kl(mixture)
+    with pytest.raises(NotAvailableError, match="without the noise"):
+        mixture.log_prob_of_sample(jnp.zeros(2))
     mixed = replace(SETTING, network=replace(NETWORK, head="mixture"))
     for name in ("ppo", "ppo-careful", "reinforce", "reinforce-careful"):
         method = methods.find(name)

@@ -263,7 +263,7 @@ def make_reinforce(setting: Setting, params: Any, hyper: ReinforceHyper) -> Adap
             togo = togo - togo.mean(axis=0)
 
         def loss(now: Pass, batch: Batch) -> Array:
-            return -real_mean(togo * now.actions.log_prob(batch.actions), batch.real)
+            return -real_mean(togo * now.actions.log_prob_of_sample(batch.actions), batch.real)
 
         return loss
 
@@ -283,10 +283,10 @@ def make_ppo(setting: Setting, params: Any, hyper: PpoHyper) -> Adapter:
         mean = real_mean(gains, batch.real)
         spread = jnp.sqrt(real_mean((gains - mean) ** 2, batch.real))
         gains = jax.lax.stop_gradient((gains - mean) / (spread + 1e-8))
-        old = jax.lax.stop_gradient(batch.before.log_prob(batch.actions))
+        old = jax.lax.stop_gradient(batch.before.log_prob_of_sample(batch.actions))
 
         def loss(now: Pass, batch: Batch) -> Array:
-            log_ratio = now.actions.log_prob(batch.actions) - old
+            log_ratio = now.actions.log_prob_of_sample(batch.actions) - old
             ratio = jnp.exp(jnp.where(batch.real, log_ratio, 0.0))
             clipped = jnp.clip(ratio, 1 - hyper.clip, 1 + hyper.clip)
             gained = jnp.minimum(ratio * gains, clipped * gains)
