@@ -119,6 +119,16 @@ class Cell(NamedTuple):
     """Its result folder; None if it is not available."""
     reason: str = ""
     """Why it is not available."""
+    failed: bool = False
+    """Whether it is not available because its adaptation failed."""
+
+
+class Compared(NamedTuple):
+    """A table of a comparison."""
+
+    text: str
+    failed: Sequence[str]
+    """The cells whose adaptations failed, each as "METHOD in WORLD"."""
 
 
 @dataclass(frozen=True)
@@ -190,7 +200,8 @@ def _trained_policy(config: ReproduceConfig, world: str, method: str) -> Path:
 def made(config: ReproduceConfig, world: str, method: str) -> Cell:
     """Get a cell: from earlier or published results, or by adapting now.
 
-    If the world is not installed or its policy is not released, the cell is empty.
+    If the world is not installed, its policy is not released, or the adaptation fails, as when a return is
+    not a finite number, the cell is empty.
     """
     settings = cell_config(config, world, method)
     if not settings.folder.is_dir() and (place := published(config, settings)) is not None:
@@ -208,7 +219,10 @@ def made(config: ReproduceConfig, world: str, method: str) -> Cell:
             finished(folder, settings, policy, tasks)
         else:
             print(f"{method} in {world}: {num_tasks(tasks)} tasks", file=sys.stderr)
-            adapt_and_save(folder, settings, record, env, policy, tasks)
+            try:
+                adapt_and_save(folder, settings, record, env, policy, tasks)
+            except DataError as error:
+                return Cell(world, method, None, f"{method} failed: {error}", failed=True)
     except UsageError as error:
         return Cell(world, method, None, str(error))
     return Cell(world, method, folder)
@@ -331,8 +345,8 @@ def files_of(config: ReproduceConfig) -> tuple[Path, Path]:
     return place.with_suffix(".md"), place.with_suffix(".png")
 
 
-def compare(config: ReproduceConfig) -> str:
-    """Make all missing cells, and write the table and the learning curves; returns the table."""
+def compare(config: ReproduceConfig) -> Compared:
+    """Make all missing cells, and write the table and the learning curves."""
     place, picture = files_of(config)
     check_replaceable((place, picture))
     found = list(cells(config))
@@ -342,7 +356,7 @@ def compare(config: ReproduceConfig) -> str:
     curves = _curves(found)
     if curves:
         write(picture, later(learning_curves, curves))
-    return text
+    return Compared(text, [f"{cell.method} in {cell.world}" for cell in found if cell.failed])
 
 
 def _curves(found: Sequence[Cell]) -> dict[str, dict[str, Any]]:
@@ -374,7 +388,8 @@ def _draw_in(config: ReproduceConfig, world: str) -> list[Path]:
     for method in figure.methods:
         cell = made(config, world, method)
         if cell.results is None:
-            raise UsageError(f"{config.what} is not available for {world}: {cell.reason}")
+            kind = DataError if cell.failed else UsageError
+            raise kind(f"{config.what} is not available for {world}: {cell.reason}")
         results[method] = load_results(cell.results)
     place = config.out / f"{config.what}-{config.scale}_{file_name(world)}.md"
     saves = {

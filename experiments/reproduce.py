@@ -76,7 +76,11 @@ def make(config: ReproduceConfig) -> None:
 
 
 def make_comparison(config: ReproduceConfig) -> None:
-    """Make a table of several methods in several worlds."""
+    """Make a table of several methods in several worlds.
+
+    Raises:
+      DataError: at the end, if the adaptation of a cell failed.
+    """
     join(config)
     from experiments import comparisons, robustness
 
@@ -85,10 +89,13 @@ def make_comparison(config: ReproduceConfig) -> None:
         return
     behind_noise = config.what == "table3"
     with processes.apart():  # all cells are made now, and process 0 alone makes the table
-        say(robustness.compare(config) if behind_noise else comparisons.compare(config))
+        made = robustness.compare(config) if behind_noise else comparisons.compare(config)
+    say(made.text)
     place = comparisons.files_of(config)[0]
     text = f"table in {place}" if behind_noise else f"table and curves in {place} and .png"
     print(text, file=sys.stderr)
+    if made.failed:
+        raise DataError(f"{', '.join(made.failed)} failed; the notes below the table say why")
 
 
 def make_all(config: ReproduceConfig) -> None:

@@ -21,6 +21,7 @@ from envs.errors import DataError, UsageError
 from experiments.comparisons import (
     PUBLISHED,
     Cell,
+    Compared,
     Notes,
     files_of,
     gap,
@@ -105,6 +106,8 @@ class Row(NamedTuple):
     """The measurement; None if it is not available."""
     reason: str = ""
     """Why it is not available."""
+    failed: bool = False
+    """Whether it is not available because the adaptation failed."""
 
 
 def sizes_of(config: ReproduceConfig) -> Sequence[Noise]:
@@ -166,7 +169,7 @@ def rows_of(config: ReproduceConfig, world: str, method: str) -> Iterator[Row]:
     cell = made(config, world, method)
     sizes = sizes_of(config)
     if cell.results is None:
-        yield from (Row(world, method, noise, None, cell.reason) for noise in sizes)
+        yield from (Row(world, method, noise, None, cell.reason, cell.failed) for noise in sizes)
         return
     rows = {noise: Row(world, method, noise, known(config, cell, noise)) for noise in sizes}
     cases = {}
@@ -226,8 +229,8 @@ def _line(row: Row, notes: Notes) -> list[str]:
     ]
 
 
-def compare(config: ReproduceConfig) -> str:
-    """Measure all missing rows, and write the table; returns it."""
+def compare(config: ReproduceConfig) -> Compared:
+    """Measure all missing rows, and write the table."""
     place = files_of(config)[0]
     check_replaceable([place])
     rows = [
@@ -239,4 +242,5 @@ def compare(config: ReproduceConfig) -> str:
     text = f"{table_of(config).title}\n\n{as_table(rows)}"
     place.parent.mkdir(parents=True, exist_ok=True)
     write_sealed(place, lambda path: path.write_text(text, encoding="utf-8"))
-    return text
+    failed = dict.fromkeys(f"{row.method} in {row.world}" for row in rows if row.failed)
+    return Compared(text, list(failed))

@@ -224,6 +224,29 @@ def test_figures_are_drawn_of_published_results(
         comparisons.draw(replace(config, env=("crafter",)))
 
 
+def test_a_cell_that_fails_is_a_dash_and_the_others_are_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fails(*args: Any, **options: Any) -> None:
+        raise DataError("a return is not a finite number")
+
+    monkeypatch.setattr(comparisons, "adapt_and_save", fails)
+    config = ReproduceConfig(what="table1", env=("maze15",), only=("gcbc", "ucb"), out=tmp_path)
+    says = "gcbc in maze15 failed; the notes below the table say why"
+    with pytest.raises(DataError, match=says):
+        main(config)
+    printed = capsys.readouterr().out
+    assert "| maze15 | GC-BC | -2.63 | - | - | - | - | - |" in printed
+    assert "- maze15: gcbc failed: a return is not a finite number\n" in printed
+    assert re.search(r"maze15 \| MGPO-UCB \| .* \| -0\.\d+ ± ", printed)
+    assert "- maze15: gcbc failed" in (tmp_path / "table1-cpu.md").read_text()
+    monkeypatch.setattr(comparisons, "published", lambda *_: None)
+    with pytest.raises(
+        DataError, match=r"figure2 is not available for maze15: .* failed: a return"
+    ):
+        comparisons.draw(replace(config, what="figure2"))
+
+
 def test_every_method_of_a_comparison_is_known() -> None:
     for name, comparison in comparisons.TABLES.items():
         for method in (*comparison.methods, *comparison.further):

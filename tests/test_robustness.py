@@ -71,7 +71,7 @@ def unpublished(monkeypatch: pytest.MonkeyPatch) -> list[Noise]:
 
 def test_missing_rows_are_measured_once(unpublished: list[Noise], tmp_path: Path) -> None:
     config = replace(CONFIG, out=tmp_path)
-    text = robustness.compare(config)
+    text = robustness.compare(config).text
     assert unpublished == [*robustness.SIZES[1:]]  # all that this world has
     rows = [
         [cell.strip() for cell in line.strip("|").split("|")]
@@ -91,7 +91,7 @@ def test_missing_rows_are_measured_once(unpublished: list[Noise], tmp_path: Path
     place = robustness.place_of_row(config, Cell("kitchen", "ucb", UCB), Noise(action=0.1))
     place.unlink()
     unpublished.clear()
-    again = robustness.compare(config)
+    again = robustness.compare(config).text
     assert unpublished == [Noise(action=0.1)]
     assert again.splitlines()[:10] == text.splitlines()[:10]
 
