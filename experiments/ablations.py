@@ -14,14 +14,13 @@ from typing import Any, NamedTuple
 
 import envs
 from envs.errors import NotAvailableError, nearest
-from experiments.adaptation import adapt_all, deciding, save_outcome
+from experiments.adaptation import adapt_all, deciding, finished, save_outcome
 from experiments.drawing import write
 from experiments.figures import later, learning_curve
 from experiments.signals import GO_ON, farewell, kept
 from experiments.store import runs
 from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.paper import paper_value
-from experiments.store.policies import check_weights
 from experiments.store.presets import pretrain_preset
 from experiments.store.provenance import provenance
 from experiments.store.reproduce_settings import ReproduceConfig
@@ -96,9 +95,15 @@ def planned(
 
 
 def trained(settings: PretrainConfig) -> Path:
-    """Run or continue a training unless it is finished; returns the folder of its policy."""
+    """Run or continue a training unless it is finished; returns the folder of its policy.
+
+    Raises:
+      UsageError: if it was finished or begun with other settings.
+    """
     folder = settings.folder
-    if not runs.is_finished(folder):
+    if runs.is_finished(folder):
+        runs.check_settings(settings)
+    else:
         print(f"training {folder}", file=sys.stderr)
         train(replace(settings, resume=runs.has_begun(folder)), GO_ON)
     return folder / runs.POLICY
@@ -117,6 +122,10 @@ def adapted(
       policy_folder: folder of the policy; None for the released one.
       folders: result folders to write, with the hyper-parameters of each.
       method: name of the adaptation method.
+
+    Raises:
+      UsageError: if finished results are of other settings or tasks.
+      DataError: if they are of other weights.
     """
     world, env = envs.find(config.world), envs.make(config.world)
     policy = load_policy(world, policy_folder)
@@ -133,8 +142,9 @@ def adapted(
         )
         for folder, hyper in folders.items()
     ]
-    for folder in filter(Path.exists, folders):
-        check_weights(load_results(folder, ()), policy, f"remove {folder}")
+    for settings in configs:
+        if settings.folder.exists():
+            finished(settings.folder, settings, policy, tasks)
     # All variants count, finished or not, so that an interruption between two of them changes nothing.
     variants = {"variants": [deciding(settings, policy, tasks) for settings in configs]}
     mark = hashlib.sha256(json.dumps(variants).encode()).hexdigest()[:12]
@@ -149,7 +159,8 @@ def adapted(
             outcomes = adapt_all(world, env, policy, tasks, configs, journal)
             for settings, outcome in zip(configs, outcomes, strict=True):
                 if not settings.folder.exists():
-                    save_outcome(settings.folder, settings, env, policy, tasks, outcome, meta)
+                    made = {**meta, "settings": deciding(settings, policy, tasks)}
+                    save_outcome(settings.folder, settings, env, policy, tasks, outcome, made)
         shutil.rmtree(pieces)
 
 

@@ -229,12 +229,17 @@ def made(config: ReproduceConfig, world: str, method: str) -> Cell:
 
 
 def _train(folder: Path, world: str, kind: str) -> None:
-    """Run or continue the training of a network with the preset "paper", unless it is finished."""
+    """Run or continue the training of a network with the preset "paper", unless it is finished.
+
+    Raises:
+      UsageError: if it was finished or begun with other settings.
+    """
+    preset = replace(pretrain_preset(world, "paper", kind), out=folder)
     if runs.is_finished(folder):
+        runs.check_settings(preset)
         return
-    preset = pretrain_preset(world, "paper", kind)
     print(f"training {folder}", file=sys.stderr)
-    train(replace(preset, out=folder, resume=runs.has_begun(folder)), GO_ON)
+    train(replace(preset, resume=runs.has_begun(folder)), GO_ON)
 
 
 def published(config: ReproduceConfig, settings: AdaptConfig) -> Path | None:

@@ -25,6 +25,7 @@ from experiments.store.result_files import load_results
 from experiments.store.settings import PretrainConfig
 from experiments.store.summary import read_summary
 from mgpo_jax import methods
+from mgpo_jax.files import write_json
 from mgpo_jax.settings import check_settings
 from mgpo_jax.tasks import test_tasks as released_tasks
 
@@ -79,7 +80,21 @@ def test_table5_from_data_to_table(tiny: Path, monkeypatch: pytest.MonkeyPatch) 
     main(config)
     assert (folder / "table5.md").read_text() == text
 
-    summary = folder / "table5" / "astar2-k5-2steps-24episodes-1seeds" / "summary.json"
+    results = folder / "table5" / "astar2-k5-2steps-24episodes-1seeds"
+    for path, old, new, says in (
+        (results / "meta.json", '"episodes": 2', '"episodes": 3', "holds results of other settings"),
+        (
+            folder / "policies" / "astar2-k5-2steps-24episodes" / "config.json",
+            '"holdout": 4', '"holdout": 5', "was started with other settings: holdout 5 -> 4",
+        ),
+    ):  # fmt: skip
+        text = path.read_text()
+        assert old in text
+        path.write_text(text.replace(old, new))
+        with pytest.raises(UsageError, match=says):
+            main(config)
+        path.write_text(text)
+    summary = results / "summary.json"
     summary.write_text(json.dumps({**json.loads(summary.read_text()), "policy_sha256": "0" * 64}))
     with pytest.raises(DataError, match=r"are not those .* \(0{12}\): remove .*1seeds"):
         main(config)
@@ -101,6 +116,7 @@ def test_a_stopped_training_goes_on(tiny: Path, monkeypatch: pytest.MonkeyPatch)
     policy.mkdir()
     ablations.trained(longer)
     assert len(asked) == 3  # the policy is only half there
+    write_json(policy.parent / "config.json", longer)
     for name in ("policy/config.json", "policy/weights.npz", "training.png"):
         (policy.parent / name).touch()
     ablations.trained(longer)
@@ -207,23 +223,6 @@ def test_a_published_cell_of_fewer_seeds_stands_until_there_is_one_of_all(
     assert comparisons.made(config, "maze30", "ppo").results == with_all
 
 
-def test_figures_are_drawn_of_published_results(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def never(*args: Any, **options: Any) -> None:
-        raise AssertionError("what is published was done again")
-
-    monkeypatch.setattr(comparisons, "adapt_and_save", never)
-    config = ReproduceConfig(what="figure2", out=tmp_path)
-    (drawn,) = comparisons.draw(config)
-    assert drawn == tmp_path / "figure2-cpu_maze15_prompts.png"
-    assert drawn.stat().st_size > 0
-    absent = comparisons.Cell("crafter", "ucb", None, "no network is released")
-    monkeypatch.setattr(comparisons, "made", lambda *_: absent)
-    with pytest.raises(UsageError, match="figure2 is not available for crafter: no network is"):
-        comparisons.draw(replace(config, env=("crafter",)))
-
-
 def test_a_cell_that_fails_is_a_dash_and_the_others_are_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -245,6 +244,23 @@ def test_a_cell_that_fails_is_a_dash_and_the_others_are_made(
         DataError, match=r"figure2 is not available for maze15: .* failed: a return"
     ):
         comparisons.draw(replace(config, what="figure2"))
+
+
+def test_figures_are_drawn_of_published_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(*args: Any, **options: Any) -> None:
+        raise AssertionError("what is published was done again")
+
+    monkeypatch.setattr(comparisons, "adapt_and_save", never)
+    config = ReproduceConfig(what="figure2", out=tmp_path)
+    (drawn,) = comparisons.draw(config)
+    assert drawn == tmp_path / "figure2-cpu_maze15_prompts.png"
+    assert drawn.stat().st_size > 0
+    absent = comparisons.Cell("crafter", "ucb", None, "no network is released")
+    monkeypatch.setattr(comparisons, "made", lambda *_: absent)
+    with pytest.raises(UsageError, match="figure2 is not available for crafter: no network is"):
+        comparisons.draw(replace(config, env=("crafter",)))
 
 
 def test_every_method_of_a_comparison_is_known() -> None:
