@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import envs
 from envs.errors import NotAvailableError, nearest
 from experiments.adaptation import adapt_all, deciding, finished, save_outcome
+from experiments.comparisons import gap
 from experiments.drawing import write
 from experiments.figures import later, learning_curve
 from experiments.signals import GO_ON, farewell, kept
@@ -321,7 +322,15 @@ def files_of(config: ReproduceConfig) -> tuple[Path, Path]:
 
 def as_table(lines: Sequence[Line]) -> str:
     """The table in Markdown, with a row for each line."""
-    head = ["", "initial", "final (mean ± std over seeds)", "regret", "after 40", "paper: final"]
+    head = [
+        "",
+        "initial",
+        "final (mean ± std over seeds)",
+        "regret",
+        "after 40",
+        "paper: final",
+        "gap",
+    ]
     rows = []
     for line in lines:
         summary = read_summary(line.results)
@@ -334,6 +343,7 @@ def as_table(lines: Sequence[Line]) -> str:
                 number(summary["regret"]),
                 number(summary["regret_after_40"]),
                 line.paper,
+                gap(line.paper, summary["final_return"]),
             ]
         )
     return table(head, rows)

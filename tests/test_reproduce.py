@@ -64,8 +64,9 @@ def test_table5_from_data_to_table(tiny: Path, monkeypatch: pytest.MonkeyPatch) 
     assert "2 gradient steps on 24 trajectories each" in text
     assert head.split("|")[2].strip() == "initial"
     (row,) = rows
-    label, initial, *_, paper = (cell.strip() for cell in row.strip("|").split("|"))
+    label, initial, final, *_, paper, gap = (cell.strip() for cell in row.strip("|").split("|"))
     assert (label, paper) == ("astar2", "-0.36 ± 0.02")
+    assert float(gap) == pytest.approx(float(final) + 0.36, abs=0.006)
     results = load_results(folder / "table5" / "astar2-k5-2steps-24episodes-1seeds")
     assert results.returns.shape == (1, 2, 2)
     assert float(initial) == pytest.approx(results.eval_returns[:, :, 0].mean(), abs=0.01)
