@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import envs
 from envs.errors import NotAvailableError, nearest
 from experiments.adaptation import adapt_all, deciding, finished, save_outcome
-from experiments.comparisons import gap
+from experiments.comparisons import PUBLISHED, gap, published
 from experiments.drawing import write
 from experiments.figures import later, learning_curve
 from experiments.signals import GO_ON, farewell, kept
@@ -166,8 +166,12 @@ def adapted(
 
 
 def table4(config: ReproduceConfig) -> list[Part]:
-    """The maximum prompt length K and the exploration constant c, with the released policy (Table 4)."""
+    """The maximum prompt length K and the exploration constant c, with the released policy (Table 4).
+
+    The last K is that of the policy's recipe, the default of UCB, so published results of UCB have it.
+    """
     world = envs.find(config.world)
+    own = pretrain_preset(config.world, "fast").max_prompt_length
 
     def part(label: str, name: str, hyper: UcbHyper, together: str) -> Part:
         results = config.folder / "table4" / f"{name}-{config.seeds}seeds"
@@ -175,8 +179,12 @@ def table4(config: ReproduceConfig) -> list[Part]:
 
     lengths = [
         part(f"K = {k}", f"K{k}", UCB.hyper_in(world, {"max_goals": k}), "K")
-        for k in (1, 2, 3, LONGEST)
+        for k in sorted({1, 2, 3, LONGEST, own})
     ]
+    usual = AdaptConfig(env=config.world, seeds=config.seeds, episodes=EPISODES)
+    place = published(config, usual)
+    if place is not None and read_summary(place)["num_seeds"] == config.seeds:
+        lengths = [x._replace(results=place) if x.name == f"K = {own}" else x for x in lengths]
     constants = [  # Eq. 3 as printed
         part(f"c = {c}", f"c{c}", UcbHyper(c=float(c), max_goals=LONGEST, scale=1.0), "c")
         for c in (0, 1, 10)
@@ -304,7 +312,9 @@ def make(config: ReproduceConfig) -> list[Line]:
         parts = list(group)
         training = parts[0].training
         policy = None if training is None else trained(training)
-        folders = {part.results: part.hyper for part in parts}
+        folders = {
+            part.results: part.hyper for part in parts if PUBLISHED not in part.results.parents
+        }
         adapted(config, policy, folders, parts[0].method)
         home = envs.find(config.world).home
         lines += [

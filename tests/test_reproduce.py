@@ -379,6 +379,17 @@ def test_table4_varies_length_and_constant(tiny: Path, monkeypatch: pytest.Monke
     assert (lines[0].paper, lines[3].paper) == ("-2.63 ± 0.00", "-0.41 ± 0.10")
 
 
+def test_table4_has_the_length_of_the_policy_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Path] = []
+    monkeypatch.setattr(ablations, "adapted", lambda *args: asked.extend(args[2]))
+    lines = ablations.make(ReproduceConfig(what="table4", env=("maze30",)))
+    assert [line.label for line in lines][3:6] == ["K = 5", "K = 20", "c = 0"]
+    assert lines[4].results == Path("results/maze30/ucb")  # published
+    assert asked == [line.results for line in lines if line is not lines[4]]
+    few = ablations.table4(ReproduceConfig(what="table4", env=("maze30",), seeds=1))
+    assert few[4].results == Path("runs/reproduce/maze30/table4/K20-1seeds")
+
+
 def test_all_goes_on_after_a_failure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
