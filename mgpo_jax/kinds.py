@@ -68,6 +68,7 @@ class Kind:
       watched: a description of the agent whose returns are monitored during training.
       preset: settings in which it differs from the presets of all worlds, by name; only the preset
         ``smoke`` may replace them.
+      settings: the settings of pre-training that apply to no other kind.
       summary: a one-line description.
     """
 
@@ -76,6 +77,7 @@ class Kind:
     title: str
     watched: str
     preset: Mapping[str, Any] = field(default_factory=dict)
+    settings: tuple[str, ...] = ()
     summary: str = ""
 
     def load(self) -> Learned:
@@ -115,6 +117,7 @@ SKILLS = Kind(
         "clip_norm": 1.0,
         "steps": 8_000,
     },
+    settings=("loop",),
 )
 
 KINDS: Registry[Kind] = Registry(

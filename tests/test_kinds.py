@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -13,7 +14,8 @@ from test_training import DATASET
 import envs
 from envs.base import ArraySpec, Discrete, EnvSpec
 from envs.errors import DataError, UsageError
-from experiments.store.presets import pretrain_preset
+from experiments.networks import sized_network
+from experiments.store.presets import check_pretraining, pretrain_preset
 from experiments.store.settings import PretrainConfig
 from mgpo_jax import methods
 from mgpo_jax.baselines.commanded import CommandConfig
@@ -138,8 +140,6 @@ def test_settings_of_a_kind_win_in_all_presets_but_smoke():
     assert kind.train.optimizer == "adamw"
     assert kind.data == world.data
     assert pretrain_preset("gridworld", "smoke", "spirl").train.steps == 40
-    assert kind.folder != world.folder
-    assert PretrainConfig().method == MULTI_GOAL
     for preset in (
         "fast",
         "paper",
@@ -149,6 +149,18 @@ def test_settings_of_a_kind_win_in_all_presets_but_smoke():
         assert train.steps == 8_000
     assert pretrain_preset("gridworld", "paper").train.learning_rate == 1e-4
     assert pretrain_preset("kitchen", "fast", "spirl").train.batch_size == 32  # the world's
+    assert kind.folder != world.folder
+    assert PretrainConfig().method == MULTI_GOAL
+
+
+def test_skills_of_a_closed_loop_can_be_asked_for():
+    config = replace(pretrain_preset("gridworld", "smoke", "spirl"), loop="closed")
+    check_pretraining(config)
+    assert sized_network(config, envs.make("gridworld").spec).loop == "closed"
+    with pytest.raises(UsageError, match="--loop closed does not apply to --method mgpo"):
+        check_pretraining(replace(config, method=MULTI_GOAL))
+    with pytest.raises(UsageError, match="--loop closed does not apply to --init"):
+        check_pretraining(replace(config, init=Path("policy")))
 
 
 def test_every_method_starts_from_a_kind_that_there_is():

@@ -137,7 +137,13 @@ def check_pretraining(config: PretrainConfig) -> None:
         raise UsageError(
             f"--batch-size {train.batch_size} is not a multiple of --part-size {train.part_size}"
         )
+    if config.loop == "closed" and "loop" not in KINDS.find(config.method).settings:
+        raise UsageError(f"--loop closed does not apply to --method {config.method}; leave it out")
     if config.init is not None and not goes_on(config):
+        if config.loop == "closed":
+            raise UsageError(
+                "--loop closed does not apply to --init, which fixes the network; leave it out"
+            )
         check_initial(config)
     if config.standardize_obs and config.encoder != "linear":
         raise UsageError(

@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -119,6 +119,9 @@ class PretrainConfig(Joined):
     tokens_per_step: TokensPerStep = 2
     """Tokens per time step: 2 for an observation token and an action token, 1 for the sum of the previous
     action and the observation [2]."""
+    loop: Literal["open", "closed"] = "open"
+    """How the skills of spirl are decoded: all steps from the first observation (open), or each step from
+    its own (closed)."""
     encoder: EncoderName = "linear"
     """Observation encoder [linear]; ``cells`` embeds the codes and counts of worlds that have them, and the
     others each serve the one world that defines them."""
