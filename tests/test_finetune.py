@@ -16,7 +16,7 @@ from envs.episodes import run_episode
 from envs.errors import NotAvailableError, UsageError
 from envs.registry import Judgement
 from mgpo_jax import methods
-from mgpo_jax.adaptation import Adapter, search
+from mgpo_jax.adaptation import Adapter, proceed, search, start
 from mgpo_jax.baselines import finetune
 from mgpo_jax.baselines.finetune import (
     Batch,
@@ -342,6 +342,39 @@ def shifted(batch: Batch, by: float) -> Pass:
     return Pass(type(batch.before)(logits), jnp.zeros_like(batch.values))
 
 
+def test_the_gradient_of_reinforce_is_that_of_the_expected_return(
+    params: Any, round_of_episodes: Any
+) -> None:
+    """On a bandit of two actions, each of which weighs as often as it is drawn."""
+    _, state, query, episodes = round_of_episodes
+    tuner = tuner_of(make_reinforce, ReinforceHyper(), params)
+    two = jax.tree.map(lambda leaf: leaf[:2], episodes)
+    trajectory = two.trajectory._replace(
+        obs=jnp.stack([two.trajectory.obs[0]] * 2),
+        actions=jnp.zeros_like(two.trajectory.actions).at[:, 0].set(jnp.arange(2)),
+        length=jnp.ones(2, jnp.int32),
+    )
+    pays = jnp.array([0.3, 2.0])
+
+    def chances(policy: Any) -> jax.Array:
+        weights = Weights(policy, state.weights.value)
+        now = tuner._forward(
+            weights, tuner._batch(state, query, two._replace(trajectory=trajectory))
+        )
+        return jax.nn.softmax(now.actions.logits[0, 0])
+
+    weighed = 2 * pays * chances(params)  # the loss is a mean over two episodes
+    rewards = jnp.zeros_like(two.rewards).at[:, 0].set(weighed)
+    batch = tuner._batch(state, query, two._replace(trajectory=trajectory, rewards=rewards))
+    loss = lambda policy: tuner.how.loss(batch)(  # noqa: E731
+        tuner._forward(Weights(policy, state.weights.value), batch), batch
+    )
+    found = jax.jit(jax.grad(loss))(params)
+    wanted = jax.jit(jax.grad(lambda policy: -pays @ chances(policy)))(params)
+    assert_close(found, wanted, 1e-5)
+    assert optax.tree.norm(wanted) > 0.01
+
+
 @pytest.mark.parametrize("baseline", [False, True])
 def test_the_loss_of_reinforce_by_hand(params: Any, batch: Batch, baseline: bool) -> None:
     tuner = tuner_of(make_reinforce, ReinforceHyper(baseline=baseline, discount=0.5), params)
@@ -523,3 +556,24 @@ def test_values_alone_are_learned_at_first(params: Any, round_of_episodes: Any) 
     returns = jax.vmap(returns_to_go, (0, None))(episodes.rewards, 0.98)
     missed = (state.weights.value(features) - returns)[real]
     assert float((missed**2).mean()) < 0.5 * float((returns[real] ** 2).mean())
+
+
+def test_the_values_of_a_chain_are_the_discounted_returns_of_its_best_policy(params: Any) -> None:
+    """After PPO has learned to go right, V(s) is the discount to the power of the steps that are left."""
+    hyper = PpoHyper(**FAST, value_rate=0.01, discount=0.8)
+    adapter = make_ppo(SETTING, params, hyper)
+
+    @jax.jit
+    def learned(key: Any) -> Any:
+        state = start(key, ENV, adapter, TASK)
+        state, _, _ = proceed(state, ENV, adapter, TASK, 80, max_rounds=80)
+        return state.search.weights
+
+    weights = learned(jax.random.key(9))
+    obs, actions = jnp.eye(NUM_STATES)[: NUM_STATES - 1], jnp.ones(NUM_STATES - 1, jnp.int32)
+    features = GoalTransformer(NETWORK).apply(
+        weights.policy, single_goal(GOAL, 2), obs, actions, method="features"
+    )
+    np.testing.assert_allclose(weights.value(features), 0.8 ** np.arange(3, -1, -1), atol=0.1)
+    log_probs = GoalTransformer(NETWORK).apply(weights.policy, single_goal(GOAL, 2), obs, actions)
+    assert log_probs.mode().tolist() == [1, 1, 1, 1]

@@ -310,6 +310,34 @@ def test_the_q_function_is_that_of_value_iteration(params):
     assert state.updates == 3_000
 
 
+def test_a_weight_of_zero_is_q_learning_without_a_prior(params):
+    """What the prior says then changes no bit."""
+    hyper = PtgmHyper(batch_size=4, kl=0.0)
+    task, goal = ENV.sample_task(jax.random.key(2)), jnp.zeros(CONFIG.goal_dim)
+    other = jax.tree.map(jnp.copy, params)
+    (name,) = [name for name in other["params"] if "prior" in name]
+    other["params"][name] = jax.tree.map(lambda leaf: 3 * leaf + 1, other["params"][name])
+
+    def learned(low: Any, hyper: PtgmHyper) -> Any:
+        ptgm = learner(hyper, low)
+        state = ptgm.init(jax.random.key(0), goal)
+        choice, state = ptgm.ask(jax.random.key(1), state)
+
+        @jax.jit
+        def told(state: Any) -> Any:
+            episode = run_episode(jax.random.key(1), ENV, ptgm.agent(state, choice), task)
+            episodes = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], episode)
+            return ptgm.tell(jax.random.key(3), state, choice, episodes)
+
+        return told(state).params
+
+    first, second = (jax.tree.leaves(learned(low, hyper)) for low in (params, other))
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a, b)
+    weighed = jax.tree.leaves(learned(other, replace(hyper, kl=0.5)))
+    assert any(np.any(np.asarray(a != b)) for a, b in zip(first, weighed, strict=True))
+
+
 def test_the_target_is_replaced_every_tenth_update(params):
     ptgm = learner(PtgmHyper(batch_size=4), params)
     state = ptgm.init(jax.random.key(0), jnp.zeros(CONFIG.goal_dim))

@@ -252,6 +252,56 @@ def test_a_large_alpha_keeps_the_prior(params):
     assert agent.divergence(agent.policy(state.weights.actor, seen), seen)[0] < 1e-3
 
 
+@pytest.mark.parametrize("alpha", [1.0, 0.0])
+def test_the_policy_of_one_state_is_the_closed_form(params, monkeypatch, alpha):
+    """For the reward -c/2 (z - m)^2 and N(0, I) it is N(c m / (alpha + c), alpha / (alpha + c))."""
+    monkeypatch.setattr(
+        Spirl, "divergence", lambda self, policy, seen: policy.kl(standard(OPEN.latent_dim))
+    )
+    center, curve = 1.0, 2.0
+    agent = spirl(SpirlHyper(learning_rate=3e-3, alpha=1.0), params)
+    exact = lambda self, critics, seen, z: jnp.broadcast_to(  # noqa: E731
+        -curve / 2 * ((z - center) ** 2).sum(axis=-1), (2, len(z))
+    )
+    monkeypatch.setattr(Spirl, "values", exact)
+    state = agent.init(jax.random.key(0), jnp.zeros(ENV.spec.goal_dim))
+    log_alpha = jnp.log(jnp.float32(alpha))  # minus infinity is a weight of exactly 0
+    now = one_state(params, jnp.zeros((256, OPEN.latent_dim)), jnp.zeros(256))
+
+    def update(state: Any, key: jax.Array) -> tuple[Any, None]:
+        state = agent.improved(key, state, now, now)
+        return state._replace(weights=state.weights._replace(log_alpha=log_alpha)), None
+
+    state = state._replace(weights=state.weights._replace(log_alpha=log_alpha))
+    keys = jax.random.split(jax.random.key(1), 1_500)
+    state = jax.jit(lambda state: jax.lax.scan(update, state, keys)[0])(state)
+    found = agent.policy(state.weights.actor, jnp.zeros(OPEN.embed_dim))
+    np.testing.assert_allclose(found.mean, curve * center / (alpha + curve), atol=0.05)
+    variance = np.exp(2 * np.asarray(found.log_std))
+    # A variance of 0 is only approached, since the network puts out its logarithm.
+    np.testing.assert_allclose(variance, alpha / (alpha + curve), atol=0.05)
+
+
+def test_the_weight_of_the_divergence_of_skills(params):
+    """The loss grows with beta by the divergence, and with a weight of 0 the encoder is not held back."""
+    trajectory, key = make_trajectory(OPEN), jax.random.key(3)
+
+    def at(beta: float) -> tuple[Any, Any]:
+        config = replace(OPEN, beta=beta)
+        loss = lambda params: skill_loss(params, key, config, trajectory, True)[0]  # noqa: E731
+        return jax.value_and_grad(loss)(params)
+
+    (free, free_grad), (some, some_grad), (much, much_grad) = map(at, (0.0, 1.0, 1e3))
+    assert some > free
+    np.testing.assert_allclose(much - free, 1e3 * (some - free), rtol=1e-3)
+    away = optax.tree.sub(some_grad, free_grad)  # what the divergence alone teaches
+    assert optax.tree.norm(away) > 0
+    for found, wanted in zip(
+        jax.tree.leaves(optax.tree.sub(much_grad, free_grad)), jax.tree.leaves(away), strict=True
+    ):
+        np.testing.assert_allclose(found, 1e3 * wanted, rtol=1e-2, atol=1e-2)
+
+
 def test_the_value_of_the_next_decision_is_discounted_once(params):
     """Q of a decision that pays nothing is gamma times the worth of the next one, which is at its end."""
     agent = spirl(SpirlHyper(learning_rate=3e-3, discount=0.9, target_divergence=1e3), params)
