@@ -17,7 +17,7 @@ import numpy as np
 import envs
 from envs.base import Episode
 from envs.errors import UsageError, printable
-from envs.registry import World
+from envs.registry import Judgement, World
 from experiments.figures import (
     STYLE,
     Play,
@@ -33,9 +33,11 @@ from experiments.store.seals import is_foreign, write_sealed
 from experiments.store.settings import file_name
 from experiments.store.statistics import same_tasks
 from mgpo_jax.judging import play
+from mgpo_jax.optimizers.methods import judged_query
 from mgpo_jax.prompts import prompt_of
-from mgpo_jax.rollout import Query
 
+EXPLORING = Judgement(mode="sample")
+"""With exploratory actions of the policy's own distribution, for figures of where episodes go."""
 Picture = tuple[str, Save]
 """A file name, and a function that writes the file."""
 
@@ -94,13 +96,24 @@ def pictures_together(
 
 
 def player_of(results: Results, policy_folder: Path | None = None) -> Play:
-    """A function that runs episodes under prompts, with the policy that an adaptation was made with."""
+    """A function that runs episodes under prompts, with the policy that an adaptation was made with.
+
+    Episodes that show how good a prompt is are played in the way in which returns are measured. In a world
+    whose policies are judged by sampled actions, a greedy episode would not be what the tables tell of.
+
+    Args:
+      results: an adaptation.
+      policy_folder: folder of its policy (default: the one that the results name).
+
+    Raises:
+      DataError: if the policy is not found, or is not the one that the prompts were found with.
+    """
     world, env = envs.find(results.env), results.environment
     policy = load_policy_of(results, world, policy_folder)
 
-    def play_goals(key: jax.Array, task: Any, goals: np.ndarray, num: int, greedy: bool) -> Episode:
+    def play_goals(key: jax.Array, task: Any, goals: np.ndarray, num: int, judged: bool) -> Episode:
         prompt = prompt_of(goals, policy.config.max_prompt_length)
-        query = Query(prompt, jnp.asarray(greedy))
+        query = judged_query(prompt, world.judged if judged else EXPLORING)
         return play(key, env, policy, jax.tree.map(jnp.asarray, task), query, num)
 
     return play_goals

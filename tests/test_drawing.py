@@ -19,7 +19,7 @@ from envs.base import Environment
 from envs.errors import DataError, UsageError
 from envs.gridworld import GRIDWORLD
 from envs.gridworld.env import NONE, GridWorld
-from envs.registry import WORLDS, World
+from envs.registry import WORLDS, Judgement, World
 from experiments import drawing, evaluation
 from experiments.plot import PlotConfig, main
 from experiments.store.policies import check_weights
@@ -223,10 +223,25 @@ def test_episodes_are_those_of_the_policy_under_the_prompt(policy: Path) -> None
     results = mazes(policy)
     play = drawing.player_of(results)
     goals = results.best_goals(0, 0)
-    greedy = play(jax.random.key(0), results.task(0), goals, 3, True)
+    greedy = play(jax.random.key(0), results.task(0), goals, 3, True)  # as mazes judge policies
     assert greedy.trajectory.obs.shape == (3, 6, *ENV.spec.obs.shape)
     assert isinstance(greedy.return_, np.ndarray)
     assert np.ptp(greedy.trajectory.actions, axis=0).max() == 0  # mazes are deterministic
+    explored = play(jax.random.key(0), results.task(0), goals, 64, False)
+    assert np.ptp(explored.trajectory.actions, axis=0).max() > 0
+
+
+@pytest.mark.parametrize(("temperature", "vary"), [(1.0, True), (1e-3, False)])
+def test_episodes_are_sampled_where_the_world_judges_by_samples(
+    policy: Path, monkeypatch: pytest.MonkeyPatch, temperature: float, vary: bool
+) -> None:
+    """At its temperature: close to 0, samples are the most likely actions."""
+    judged = Judgement(mode="sample", temperature=temperature, episodes=4)
+    monkeypatch.setattr(WORLDS, "find", lambda name: replace(TINY, judged=judged))
+    results = mazes(policy)
+    play, goals = drawing.player_of(results), results.best_goals(0, 0)
+    played = play(jax.random.key(0), results.task(0), goals, 64, True)
+    assert (np.ptp(played.trajectory.actions, axis=0).max() > 0) == vary
     explored = play(jax.random.key(0), results.task(0), goals, 64, False)
     assert np.ptp(explored.trajectory.actions, axis=0).max() > 0
 

@@ -418,9 +418,10 @@ def test_a_video_shows_another_order_where_the_world_asks_for_it(another_order, 
     result = replace(fake_results(), found=[{1: goals}] * 2)
     played = []
 
-    def play(key, task, goals, num, greedy):
+    def play(key, task, goals, num, judged):
+        assert (num, judged) == (1, True)
         played.append(goals)
-        return PLAY(key, task, goals, num, greedy)
+        return PLAY(key, task, goals, num, judged)
 
     drawn = []
     offered = Pictures(

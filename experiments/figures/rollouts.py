@@ -36,8 +36,9 @@ LABEL_ROOM = (0.9, 0.65)  # inches: width of row labels, and height of title and
 FRAME_HEIGHT = 200  # height that small frames are enlarged to, in pixels
 
 Play = Callable[[jax.Array, Task, np.ndarray, int, bool], Episode]
-"""``(key, task, goals [k, G], num, greedy) -> Episode``: runs ``num`` episodes on a task under a prompt;
-numpy leaves ``[num, ..]``."""
+"""``(key, task, goals [k, G], num, judged) -> Episode``: runs ``num`` episodes on a task under a prompt;
+numpy leaves ``[num, ..]``. With ``judged``, the policy acts as the world judges policies
+(``World.judged``), otherwise with exploratory actions."""
 
 
 @styled
@@ -129,7 +130,10 @@ def known(
     key: jax.Array,
     stages: Sequence[int] = EARLY_STAGES,
 ) -> Figure:
-    """What a search has seen after some numbers of episodes, and a greedy episode under the best prompt."""
+    """What a search has seen after some numbers of episodes, and an episode under the best prompt.
+
+    That episode is played as the world judges policies.
+    """
     shown, reached = [], []
     for stage in stages:
         if stage <= result.returns.shape[2]:
@@ -174,7 +178,7 @@ def episodes(
     seed: int,
     key: jax.Array,
 ) -> Figure:
-    """A greedy episode on each task, under its optimized prompt."""
+    """An episode on each task under its optimized prompt, played as the world judges policies."""
     tasks, shown = _tasks_of(result, which), []
     for index, task in zip(which, tasks, strict=True):
         goals = _best_goals(result, seed, index)
@@ -196,9 +200,10 @@ def video(
     key: jax.Array,
     path: Path,
 ) -> None:
-    """Figure 5: a GIF of greedy episodes under the initial and the optimized prompt, side by side.
+    """Figure 5: a GIF of episodes under the initial and the optimized prompt, side by side.
 
-    If the world asks for it, a third episode shows the optimized goals in another order.
+    They are played as the world judges policies. If the world asks for it, a third episode shows the
+    optimized goals in another order.
     """
     task, optimized = result.task(index), _best_goals(result, seed, index)
     named = {"Initial prompt": result.task_goals[index][None], "Optimized prompt": optimized}
