@@ -65,8 +65,8 @@ interface WorldDrawing {
   draw(context: CanvasRenderingContext2D, facts: any, scene: Scene, colors: Colors): void;
   /** What the drawing shows, for those who do not see it. */
   tell(facts: any, scene: Scene): string;
-  /** What the marks of the drawing mean. */
-  legend: [string, string][];
+  /** What the marks of the drawing mean: each has the name of a color of the page, or a color as #rrggbb. */
+  legend: [string, string][] | ((facts: any) => [string, string][]);
   /** What the marks of a drawing of `known` mean, for a world that draws it. */
   legendOfKnown?: [string, string][];
   /** An episode in progress, for a world whose rules are in the script. */

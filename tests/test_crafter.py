@@ -57,7 +57,16 @@ from craftax.craftax_classic.constants import SOLID_BLOCKS  # noqa: E402
 
 from envs.crafter import rules  # noqa: E402
 from envs.crafter.env import Crafter, CrafterState, CrafterTask  # noqa: E402
-from envs.crafter.pictures import crafter_pictures, unlocks_of, way_of  # noqa: E402
+from envs.crafter.pictures import (  # noqa: E402
+    color_of,
+    crafter_pictures,
+    joined,
+    kinds,
+    marks_of,
+    places_of,
+    unlocks_of,
+    way_of,
+)
 from envs.crafter.tiles import agent_picture, picture, tiles  # noqa: E402
 from envs.crafter.view import (  # noqa: E402
     ACHIEVEMENTS,
@@ -357,10 +366,75 @@ class TestPictures:
         some = [CrafterTask(np.asarray(tasks.seed[lane])) for lane in range(2)]
         drawn.episodes(list(figure.subplots(1, 2)), some, shown)
         figure.savefig(tmp_path / "map.png")
+        legend = [text.get_text() for text in figure.legends[0].get_texts()]
+        assert legend[-4:] == ["collected", "placed", "made", "other achievements"]
+        assert not any("prompt" in text for text in legend)
         drawn.video(tmp_path / "a.gif", some[0], shown[:1])
         assert (tmp_path / "map.png").stat().st_size > 10_000
         assert (tmp_path / "a.gif").stat().st_size > 10_000
         assert crafter_pictures(Crafter("crafter", 40, pixels=True)).frame is not None
+
+
+class TestPlacesOfPrompts:
+    def goal(self, name, *place):
+        goal = np.zeros(25, np.float32)
+        goal[ACHIEVEMENTS.index(name)] = 1
+        if place:
+            goal[22:] = 1, *((np.array(place) - 32) / 8)
+        return goal
+
+    def test_goals_at_one_cell_are_joined(self):
+        goals = [
+            self.goal("collect_wood", 30, 40), self.goal("place_table", 30, 40), self.goal("wake_up"),
+            self.goal("eat_cow", 12, 33), self.goal("collect_iron", 30, 40),
+            self.goal("collect_coal", 1e18, -1e18), self.goal("place_stone", np.nan, 5),
+        ]  # fmt: skip
+        found = places_of(np.stack(goals))
+        assert found == {(30, 40): [1, 2, 5], (12, 33): [4], (63, 0): [6], (0, 5): [7]}
+        assert places_of(np.ones((2, 22))) == {}
+        numbers = [[3], [1, 2, 5], [4, 6, 9], [7, 8, 9]]
+        assert [joined(each) for each in numbers] == [
+            "3",
+            "1\N{EN DASH}2,5",
+            "4,..",
+            "7\N{EN DASH}9",
+        ]
+
+    def test_they_are_boxes_on_the_map_and_numbers_in_the_bar(self, played):
+        from matplotlib.figure import Figure
+        from matplotlib.patches import FancyBboxPatch
+
+        tasks, episodes = played
+        episode = jax.tree.map(lambda leaf: leaf[0], episodes)
+        (first, _), *_ = unlocks_of(episode)
+        goals = [
+            self.goal("eat_plant", 40, 20), self.goal("eat_cow", 40, 20),
+            self.goal(ACHIEVEMENTS[first], 40, 20), np.pad(np.ones(22), (0, 3)),
+        ]  # fmt: skip
+        figure = Figure(figsize=(4, 6), layout="compressed")
+        ax = figure.subplots()
+        task = CrafterTask(np.asarray(tasks.seed[0]))
+        crafter_pictures(ENV).episodes([ax], [task], [Shown("", np.stack(goals), episode)])
+        figure.draw_without_rendering()
+        boxes = [patch for patch in ax.patches if isinstance(patch, FancyBboxPatch)]
+        assert len(boxes) == 2  # the start, and one for the three goals
+        wide = boxes[1].get_window_extent().width
+        assert wide > 1.3 * boxes[0].get_window_extent().width
+        assert ax.get_xlim()[0] < 20 < ax.get_xlim()[1]
+        assert ax.get_ylim()[1] < 40 < ax.get_ylim()[0]
+        texts = [text.get_text().strip() for text in ax.child_axes[0].texts]
+        assert texts[0].endswith("(goal 3)")
+        assert not any("goal" in text for text in texts[1:])
+        assert "goals of the prompt" in " ".join(
+            t.get_text() for t in figure.legends[0].get_texts()
+        )
+
+    def test_every_mark_has_a_color_that_the_legend_names(self):
+        way = np.full((23, 2), 32)
+        marks = marks_of(way, [(goal, 1 + goal) for goal in range(22)], {})
+        named = dict((color, kind) for kind, color in kinds())
+        assert {mark.color for mark in marks[1:]} == set(named)
+        assert named[color_of(ACHIEVEMENTS.index("collect_drink"))] == "collected"
 
 
 def test_nothing_is_written_beside_the_package():

@@ -95,21 +95,24 @@ def test_crafters_tracks_are_what_its_pictures_make_of_what_was_seen() -> None:
 
 
 FACTS = {
-    "side": 64, "unit": 8.0, "achievements": ["collect wood", "place table", "eat cow"],
+    "side": 64, "unit": 8.0, "places": True, "kinds": [["collected", "#009E73"], ["placed", "#0072B2"]],
+    "promptColor": "#D55E00", "achievements": ["collect wood", "place table", "eat cow"],
     "achievementColors": ["#009E73", "#0072B2", "#CC79A7"], "blocks": ["grass", "tree"],
     "blockColors": ["#00ff00", "#007700"],
 }  # fmt: skip
 
 
 def in_node(expression: str) -> Any:
-    """What Crafter's module says, with the ``arcs`` and ``rects`` that it has drawn."""
+    """What Crafter's module says, with the ``arcs``, ``rects``, ``boxes`` and ``texts`` that it drew."""
     assert NODE is not None
     bundle = Bundle()
     world = f"{bundle.add(ROOT / 'envs/crafter/page.js')}.world"
     script = f"""{bundle.source}
     const world = {world}, facts = {json.dumps(FACTS)}, arcs = [], rects = [];
+    const boxes = [], texts = [];
     const arc = (x, y, radius) => arcs.push([x, y, radius]);
-    const kinds = {{ arc, fillRect: (...sizes) => rects.push(sizes) }};
+    const kinds = {{ arc, fillRect: (...sizes) => rects.push(sizes),
+      roundRect: (...sizes) => boxes.push(sizes), fillText: (text) => texts.push(text) }};
     const context = new Proxy({{}}, {{ get: (_, name) => kinds[name] ?? (() => 0), set: () => true }});
     console.log(JSON.stringify({expression}));"""
     done = subprocess.run([NODE, "-e", script], capture_output=True, text=True, check=False)
@@ -134,17 +137,38 @@ def test_crafters_page_tells_what_was_unlocked_and_where() -> None:
 
 @needs_node
 def test_marks_on_crafters_map_do_not_cover_each_other() -> None:
-    """Eight achievements in one place, on a map whose equal cells are drawn together."""
+    """Eight achievements and nine goals in one place, on a map whose equal cells are drawn together."""
     rows = [[32, 32, 0]] + [[32, 33, 1 + step % 3] for step in range(8)]
+    at = [(0, 1), (0, 1), (0, 1), (0, 1.5), (0, 1), (0, 2), (0, 3), (0, 2), (0, 1)]
+    goals = [[1, 0, 0, 1, down / 8, right / 8] for down, right in at] + [[1, 1, 1, 0, 0, 0]]
     task = ["a" * 64] * 63 + ["a" * 60 + "bbaa"]
-    scene = f"{{ task: {json.dumps(task)}, goals: [], moments: world.moments({json.dumps(rows)}) }}"
-    arcs, rects = in_node(f"(world.draw(context, facts, {scene}, {{}}), [arcs, rects])")
+    scene = f"""{{ task: {json.dumps(task)}, moments: world.moments({json.dumps(rows)}),
+      goals: {json.dumps(goals)}.map((goal) => Float32Array.from(goal)) }}"""
+    arcs, rects, boxes, texts = in_node(
+        f"(world.draw(context, facts, {scene}, {{}}), [arcs, rects, boxes, texts])"
+    )
     assert len(rects) == 63 + 3
-    marks = np.array([arc[:2] for arc in arcs if arc[2] == 1.25])
-    assert len(marks) == 1 + 8
-    apart = np.linalg.norm(marks[:, None] - marks, axis=-1)[np.triu_indices(9, 1)]
-    assert apart.min() >= 2 * 1.25
-    assert apart.max() < 14
+    discs = [[x - radius, y - radius, 2 * radius, 2 * radius] for x, y, radius in arcs[:-1]]
+    assert len(discs) == 8
+    # Goals 1 to 3, 5 and 9 share a cell, goal 4 is rounded to that of 6 and 8, and 7 is alone.
+    assert texts == ["S", *"12345678", "1\N{EN DASH}3,..", "4,..", "7"]
+    marks = np.array([*(box[:4] for box in boxes), *discs])
+    assert len(marks) == 1 + 8 + 3
+    low, high = marks[:, :2], marks[:, :2] + marks[:, 2:]
+    both = np.minimum(high[:, None], high) - np.maximum(low[:, None], low)  # of what two share
+    covered = both.clip(0).prod(axis=-1)[np.triu_indices(len(marks), 1)]
+    assert covered.max() < 0.25 * np.pi * 1.25**2
+    assert np.ptp(low, axis=0).max() < 20
+
+
+@needs_node
+def test_crafters_legend_names_what_its_map_shows() -> None:
+    """Colors of achievements, and of the prompt where goals have places."""
+    legend = dict(in_node("world.legend(facts)"))
+    assert legend["#009E73"].endswith("; collected")
+    assert legend["#0072B2"] == "placed"
+    assert "goals of the prompt" in legend["#D55E00"]
+    assert "#D55E00" not in dict(in_node("world.legend({ ...facts, places: false })"))
 
 
 @needs_node

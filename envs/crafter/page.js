@@ -1,11 +1,12 @@
 // Crafter for HTML pages: the map of a world at its start, with the way of an agent and what it unlocked.
 
 /**
- * @typedef {{ side: number, unit: number, achievements: string[], achievementColors: string[], blocks: string[],
- *   blockColors: string[] }} Facts
+ * @typedef {{ side: number, unit: number, places: boolean, achievements: string[], achievementColors: string[],
+ *   kinds: [string, string][], promptColor: string, blocks: string[], blockColors: string[] }} Facts
  * @typedef {string[]} Task rows of letters, one for each block; a is the first kind
  * @typedef {{ row: number, column: number, unlocked: number }} Moment unlocked: the achievement of this moment, or -1
- * @typedef {{ step: number, goal: number, home: [number, number], center: [number, number] }} Unlock places as (row, column)
+ * @typedef {{ step: number, goal: number, home: [number, number] }} Unlock places as (row, column)
+ * @typedef {{ home: [number, number], center: [number, number], label: string, color: string, half: number, isBox: boolean }} Mark
  */
 
 const MARK = 1.25; // radius of a mark in cells
@@ -27,21 +28,55 @@ function goalName(facts, goal) {
   return place ? `${what} at (${place[0]}, ${place[1]})` : what;
 }
 
-/** What was unlocked, with places for marks that do not cover each other. @param {Moment[]} moments @returns {Unlock[]} */
-function unlocksOf(moments) {
-  /** @type {Unlock[]} */
-  const found = [];
-  const first = moments[0], taken = first ? [[first.row, first.column]] : [];
-  moments.forEach(({ row, column, unlocked: goal }, step) => {
-    if (goal < 0) return;
+/** What was unlocked, and where. @param {Moment[]} moments @returns {Unlock[]} */
+const unlocksOf = (moments) => moments.flatMap(({ row, column, unlocked: goal }, step) => (goal < 0 ? [] : [{ step, goal, home: [row, column] }]));
+
+/** The cells that goals name, each with the numbers of its goals. @type {(facts: Facts, goals: Goal[]) => { home: [number, number], numbers: number[] }[]} */
+function placesOf(facts, goals) {
+  /** @type {Map<string, { home: [number, number], numbers: number[] }>} */
+  const found = new Map();
+  goals.forEach((goal, i) => {
+    const home = placeOf(facts, goal);
+    if (!home) return;
+    const place = found.get(String(home)) ?? { home, numbers: [] };
+    place.numbers.push(i + 1);
+    found.set(String(home), place);
+  });
+  return [...found.values()];
+}
+
+/** The numbers of goals at one cell as a short label, such as "2–4,7"; "2,.." stands for many. @param {number[]} numbers */
+function joined(numbers) {
+  /** @type {number[][]} */
+  const runs = [];
+  for (const number of numbers) {
+    const last = runs[runs.length - 1];
+    if (last && last[last.length - 1] === number - 1) last.push(number);
+    else runs.push([number]);
+  }
+  const texts = runs.map((run) => (run.length === 1 ? `${run[0]}` : `${run[0]}\u2013${run[run.length - 1]}`));
+  return texts.length < 3 ? texts.join(",") : `${texts[0]},..`;
+}
+
+/** The marks of a map, moved aside so that they do not cover each other. @param {Facts} facts @param {Goal[]} goals @param {Moment[]} moments @returns {Mark[]} */
+function marksOf(facts, goals, moments) {
+  /** @type {Mark[]} */
+  const marks = [];
+  /** @type {(home: [number, number], label: string, color: string, isBox: boolean) => void} */
+  function put([row, column], label, color, isBox) {
+    const half = isBox ? MARK * Math.max(0.9, 0.32 * label.length + 0.3) : MARK;
     /** @type {[number, number]} */
     let center = [row, column];
-    for (let turn = 0; turn < 400 && taken.some(([r, c]) => Math.hypot(r - center[0], c - center[1]) < 2.1 * MARK); turn++)
+    const covers = (/** @type {Mark} */ other) =>
+      Math.hypot(other.center[0] - center[0], (2 * MARK * (other.center[1] - center[1])) / (half + other.half)) < 2.1 * MARK;
+    for (let turn = 0; turn < 600 && marks.some(covers); turn++)
       center = [row + 0.13 * turn * Math.sin(0.7 * turn), column + 0.13 * turn * Math.cos(0.7 * turn)];
-    taken.push(center);
-    found.push({ step, goal, home: [row, column], center });
-  });
-  return found;
+    marks.push({ home: [row, column], center, label, color, half, isBox });
+  }
+  if (moments.length) put([moments[0].row, moments[0].column], "S", PAPER, true);
+  unlocksOf(moments).forEach(({ goal, home }, i) => put(home, String(i + 1), facts.achievementColors[goal], false));
+  for (const { home, numbers } of placesOf(facts, goals)) put(home, joined(numbers), facts.promptColor, true);
+  return marks;
 }
 
 /** @type {WorldDrawing["draw"]} */
@@ -49,22 +84,17 @@ function draw(context, facts, { task, goals, moments, earlier }, colors) {
   drawMap(context, facts, task);
   drawVisits(context, facts, earlier ?? [], colors);
   drawWay(context, moments);
-  goals.forEach((goal, i) => {
-    const place = placeOf(facts, goal);
-    if (place) mark(context, place, String(i + 1), colors.prompt, colors.onDisc);
-  });
-  if (!moments.length) return;
-  const unlocks = unlocksOf(moments);
+  const marks = marksOf(facts, goals, moments);
   context.strokeStyle = INK;
   context.lineWidth = 0.18;
-  for (const { home, center } of unlocks) {
+  for (const { home, center } of marks) {
     context.beginPath();
     context.moveTo(home[1] + 0.5, home[0] + 0.5);
     context.lineTo(center[1] + 0.5, center[0] + 0.5);
     context.stroke();
   }
-  mark(context, [moments[0].row, moments[0].column], "S", PAPER, INK);
-  unlocks.forEach(({ goal, center }, i) => mark(context, center, String(i + 1), facts.achievementColors[goal], INK));
+  for (const each of marks) drawMark(context, each);
+  if (!moments.length) return;
   const last = moments[moments.length - 1];
   context.beginPath();
   context.arc(last.column + 0.5, last.row + 0.5, 0.6, 0, 7);
@@ -120,20 +150,27 @@ function drawWay(context, moments) {
   }
 }
 
-/** A labeled disc. @param {CanvasRenderingContext2D} context @param {[number, number]} place @param {string} label @param {string} color @param {string} ink */
-function mark(context, [row, column], label, color, ink) {
+/** A labeled disc or box. @param {CanvasRenderingContext2D} context @param {Mark} mark */
+function drawMark(context, { center: [row, column], label, color, half, isBox }) {
   context.beginPath();
-  context.arc(column + 0.5, row + 0.5, MARK, 0, 7);
+  if (isBox) context.roundRect(column + 0.5 - half, row + 0.5 - 0.9 * MARK, 2 * half, 1.8 * MARK, 0.4);
+  else context.arc(column + 0.5, row + 0.5, MARK, 0, 7);
   context.fillStyle = color;
   context.fill();
-  context.strokeStyle = INK;
+  context.strokeStyle = isBox ? INK : PAPER;
   context.lineWidth = 0.16;
   context.stroke();
-  context.fillStyle = ink;
+  context.fillStyle = isLight(color) ? INK : PAPER;
   context.font = `bold ${(label.length > 1 ? 1.4 : 1.7) * (MARK / 1.25)}px sans-serif`;
   context.textAlign = "center";
   context.textBaseline = "middle";
   context.fillText(label, column + 0.5, row + 0.6);
+}
+
+/** Whether dark letters can be read on a color better than light ones. @param {string} color as #rrggbb */
+function isLight(color) {
+  const [red, green, blue] = [1, 3, 5].map((at) => parseInt(color.slice(at, at + 2), 16) / 255);
+  return 0.299 * red + 0.587 * green + 0.114 * blue > 0.6;
 }
 
 /** @type {WorldDrawing} */
@@ -148,10 +185,11 @@ export const world = {
     return `Map of ${facts.side} by ${facts.side} cells. Agent at row ${last.row}, column ${last.column} after ${moments.length - 1} steps. ` +
       `Unlocked: ${unlocked.join(", ") || "nothing"}.`;
   },
-  legend: [
+  legend: (facts) => [
     ["start", "S: start, on the map as it was then"],
     ["agent", "agent at the end; its way from white to orange"],
-    ["target", "1, 2, ..: achievements, where they were unlocked"],
+    ...facts.kinds.map((/** @type {[string, string]} */ [kind, color], /** @type {number} */ i) => [color, i ? kind : `discs 1, 2, ..: achievements, where they were unlocked; ${kind}`]),
+    ...(facts.places ? [[facts.promptColor, "boxes 1, 2, ..: goals of the prompt, at the places that they name"]] : []),
   ],
   moments: (rows) => rows.map(([row, column, unlocked]) => ({ row, column, unlocked: unlocked - 1 })),
 };

@@ -10,7 +10,7 @@ from jaxtyping import Array, Int
 from matplotlib.colors import to_hex
 
 from envs.crafter.env import PLACE_UNIT, Crafter, CrafterState, CrafterTask
-from envs.crafter.pictures import blocks_of, color_of, name_of
+from envs.crafter.pictures import PROMPT, blocks_of, color_of, kinds, name_of
 from envs.crafter.rules import SIDE
 from envs.crafter.tiles import tiles
 from envs.crafter.view import BLOCKS, NUM_ACHIEVEMENTS, NUM_BLOCKS
@@ -19,15 +19,17 @@ from envs.page import Page
 
 def crafter_page(env: Crafter) -> Page:
     """Maps with the paths of agents and their achievements."""
-    del env  # all variants of Crafter have the same page
     names = [name_of(goal) for goal in range(NUM_ACHIEVEMENTS)]
     return Page(
         script=Path(__file__).with_name("page.js"),
         facts={
             "side": SIDE,
             "unit": PLACE_UNIT,
+            "places": env.places,
             "achievements": names,
             "achievementColors": [color_of(goal) for goal in range(NUM_ACHIEVEMENTS)],
+            "kinds": kinds(),
+            "promptColor": PROMPT,
             "blocks": [name.replace("_", " ") for name in BLOCKS],
             "blockColors": block_colors(),
         },

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from envs.drawing.marks import draw_box, draw_disc, draw_leader, spread_apart
+from envs.drawing.marks import box_width, draw_box, draw_disc, draw_leader, spread_apart
 from envs.drawing.palette import INK
 from envs.drawing.pictures import Pictures, Shown, Stage, observations
 from envs.drawing.video import Film, axes_in_a_row, write_films, write_gif
@@ -14,6 +14,7 @@ __all__ = [
     "Shown",
     "Stage",
     "axes_in_a_row",
+    "box_width",
     "draw_box",
     "draw_disc",
     "draw_leader",

@@ -30,14 +30,20 @@ def draw_disc(
 
 
 def draw_box(ax: Axes, label: str, color: str, x: float, y: float, size: float) -> None:
-    """Draw a box with round corners."""
-    half = 0.9 * RADIUS * size
+    """Draw a box with round corners, wider for a long label (``box_width``)."""
+    half, width = 0.9 * RADIUS * size, box_width(label, size)
     style = f"round,pad=0,rounding_size={0.25 * size}"
     box = FancyBboxPatch(
-        (x - half, y - half), 2 * half, 2 * half,
+        (x - width / 2, y - half), width, 2 * half,
         boxstyle=style, facecolor=color, edgecolor=INK, linewidth=0.8,
     )  # fmt: skip
     _draw_labeled(ax, box, label, ink_on(color), x, y, size)
+
+
+def box_width(label: str, size: float) -> float:
+    """The width of a box in cells: it is a square, unless its label needs more."""
+    bounds = TextPath((0, 0), label, size=1, prop=FONT).get_extents()
+    return max(1.8 * RADIUS * size, (bounds.x1 - bounds.x0) * _height(label, size) + 0.3 * size)
 
 
 def draw_leader(ax: Axes, home: np.ndarray, center: np.ndarray) -> None:
@@ -50,18 +56,18 @@ def draw_leader(ax: Axes, home: np.ndarray, center: np.ndarray) -> None:
 
 
 def spread_apart(
-    homes: np.ndarray, heavy: np.ndarray, gap: float, limits: tuple[float, float]
+    homes: np.ndarray, heavy: np.ndarray, gap: float | np.ndarray, limits: tuple[float, float]
 ) -> np.ndarray:
     """Move points ``[n, 2]`` away from their homes until they are ``gap`` apart, within ``limits``.
 
-    Points push each other away until none overlap. Those with room around them stay at home, and ``heavy``
-    ones are moved last.
+    The gap may differ from pair to pair, ``[n, n]``. Points push each other away until none overlap. Those
+    with room around them stay at home, and ``heavy`` ones are moved last.
     """
     # Equal points are first moved apart, each in a different direction.
     index = np.arange(len(homes))
     equal = np.all(homes[:, None] == homes[None], axis=-1)
     angle = np.pi + 2.4 * index
-    nudge = 0.05 * gap * np.stack([np.sin(angle), np.cos(angle)], axis=1)
+    nudge = 0.05 * np.max(gap) * np.stack([np.sin(angle), np.cos(angle)], axis=1)
     shared = equal.sum(axis=1) > 1
     points = homes + np.where((shared & ~heavy)[:, None], nudge, 0.0)
     pace = np.where(heavy, 0.02, 0.4)[:, None]
@@ -74,6 +80,11 @@ def spread_apart(
     return points
 
 
+def _height(label: str, size: float) -> float:
+    """The size of the letters of a label in cells; several letters are smaller than one."""
+    return 0.95 * size * (1.0 if len(label) == 1 else 0.7)
+
+
 def _draw_labeled(
     ax: Axes, shape: Patch, label: str, ink: str, x: float, y: float, size: float
 ) -> None:
@@ -82,7 +93,7 @@ def _draw_labeled(
     text = TextPath((0, 0), label, size=1, prop=FONT)
     bounds = text.get_extents()
     center = -(bounds.x0 + bounds.x1) / 2, -(bounds.y0 + bounds.y1) / 2
-    height = 0.95 * size * (1.0 if len(label) == 1 else 0.7)
+    height = _height(label, size)
     upright = Affine2D().translate(*center).scale(height, -height).translate(x, y)
     letter = PathPatch(text.transformed(upright), facecolor=ink, linewidth=0)
     letter.set(zorder=4, label=label)

@@ -99,11 +99,11 @@ export function spotAt(canvas, world, facts, event) {
   return row >= 0 && column >= 0 && row < rows && column < columns ? { row, column } : null;
 }
 
-/** What marks mean, with their colors. @param {[string, string][]} legend */
-export function legendOf(legend) {
-  return legend.map(([color, text]) => {
+/** What the marks of a world mean, with their colors. @param {WorldDrawing["legend"]} legend @param {any} facts */
+export function legendOf(legend, facts) {
+  return (typeof legend === "function" ? legend(facts) : legend).map(([color, text]) => {
     const swatch = element("span", { class: "swatch", "aria-hidden": "true" });
-    swatch.style.background = `var(--${color})`;
+    swatch.style.background = color.startsWith("#") ? color : `var(--${color})`;
     return element("span", { class: "entry" }, swatch, text);
   });
 }

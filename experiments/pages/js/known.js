@@ -59,7 +59,7 @@ function showMap(parent, { log, world, facts, task, seed, number, episode, goalN
   if (!world?.legendOfKnown)
     return fill(parent, element("p", {}, text), way.length ? element("p", { class: "quiet" }, sequence(way, goalName)) : null);
   const canvas = element("canvas", { class: "stage still", role: "img" });
-  fill(parent, canvas, element("div", { class: "legend" }, ...legendOf(world.legendOfKnown)), element("p", { class: "quiet" }, text));
+  fill(parent, canvas, element("div", { class: "legend" }, ...legendOf(world.legendOfKnown, facts)), element("p", { class: "quiet" }, text));
   const best = log.prompt(log.ofRound("best", seed, number, episode));
   drawScene(canvas, world, facts, { task, goals: best, moments: [], known: { goals, visits, way } });
   canvas.setAttribute("aria-label", `Map of what was seen, with the best prompt so far. ${text}`);

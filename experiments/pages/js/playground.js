@@ -99,7 +99,7 @@ export class Playground {
     fill(byId("task"), element("option", { value: "" }, "-"),
       ...stage.data.tasks.map(({ text }, i) => element("option", { value: i }, text ? `${i}: ${text}` : String(i))));
     byId("task").value = "0";
-    fill(byId("legend"), ...legendOf(stage.world.legend));
+    fill(byId("legend"), ...legendOf(stage.world.legend, stage.data.facts));
     const names = ["Set goals", ...stage.world.edits.map(({ name }) => name)];
     fill(byId("modes"), ...names.map((name, i) => element("button", { "data-mode": i - 1, onclick: () => this.setMode(i - 1) }, name)));
     byId("modes").hidden = names.length === 1;

@@ -228,7 +228,7 @@ class Report {
       const within = /** @type {Element} */ (event.target).matches?.("input, select, .wide");
       if (by && !within && !event.altKey && !event.ctrlKey && !event.metaKey) step(by);
     });
-    if (this.world) fill(byId("legend"), ...legendOf(this.world.legend));
+    if (this.world) fill(byId("legend"), ...legendOf(this.world.legend, this.data.world.facts));
   }
 
   togglePlay() {
