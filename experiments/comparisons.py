@@ -325,13 +325,18 @@ def _row(cell: Cell, scale: str, notes: Notes) -> list[str]:
         )
     elif size[1] < 3:
         notes.add(f"{cell.world}, {title}: {size[1]} seed(s), where the paper has 3.")
+    if fresh := summary.get("fresh"):
+        notes.add(
+            f"{cell.world}, fresh: the mean of {fresh['episodes']} sampled episodes outside of the search. "
+            "The best single episode is of the search, and is luck for the most part."
+        )
     if not methods.find(cell.method).learns:
         notes.add(f"{title} learns nothing, so the number of its episodes does not matter.")
     return [
         cell.world,
         title,
         paper,
-        str(ours),
+        f"{ours} (fresh)" if fresh else str(ours),
         gap(paper, summary["final_return"]),
         number(summary.get("best_episode_return")),
         " x ".join(map(str, size)),

@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from made_results import TINY, made_results
+from made_results import LUCKY, TINY, made_results
 from pages_data import Elements, config_of, data_of, saved
 from PIL import Image
 
@@ -255,6 +255,25 @@ def test_texts_of_files_enter_a_report_as_text(tmp_path: Path, result: Path) -> 
     facts = dict(data_of(page)["runs"][0]["facts"])
     assert facts["revision"] == facts["command"] == HOSTILE
     assert "alert(2)" in facts["folder"]
+
+
+def test_facts_of_a_world_judged_by_samples_tell_luck_from_what_is_reproducible(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, result: Path
+) -> None:
+    names = ("best single episode", "fresh", "fresh minus initial", "score", "goals achieved")
+    facts = dict(data_of(report([result]))["runs"][0]["facts"])
+    assert [facts[name] for name in names] == [""] * 5  # mazes are judged by one greedy episode
+    monkeypatch.setattr(WORLDS, "find", lambda name: replace(LUCKY, pictures=None))
+    achieved = np.full((2, 2, 2, 2), 0.5, np.float32)
+    lucky = saved(
+        tmp_path / "lucky", made_results(config=config_of("tiny"), eval_achieved=achieved)
+    )
+    facts = dict(data_of(report([lucky]))["runs"][0]["facts"])
+    assert facts["best single episode"].startswith("-1.000 (of the search")
+    assert facts["fresh"].startswith("-0.250 (the final return, of 4 sampled episodes")
+    assert facts["fresh minus initial"] == "1.750 [1.500, 2.000] (95 % over tasks)"
+    assert facts["score"].startswith("50.00 (initially 50.00; geometric mean")
+    assert facts["goals achieved"] == "50.0 % of 2 (initially 50.0 %)"
 
 
 def test_several_runs_are_compared_with_the_first(tmp_path: Path, result: Path) -> None:

@@ -331,6 +331,16 @@ def test_cells_of_table1_have_the_units_of_their_columns() -> None:
     best = float(cells["best single episode"])
     assert best == pytest.approx(summary["best_episode_return"], abs=0.0051)
     assert best > summary["final_return"]
+    assert "fresh" not in text
+    text = comparisons.as_table(
+        [
+            comparisons.Cell(
+                "crafter-symbolic", "bpe", folder.parents[1] / "crafter-symbolic" / "bpe"
+            )
+        ]
+    )
+    assert " (fresh) |" in text
+    assert "crafter-symbolic, fresh: the mean of 16 sampled episodes outside of the search." in text
 
 
 def test_the_plan_is_tried_without_each_of_its_parts(

@@ -574,7 +574,9 @@ def test_named_goals_are_counted(lucky: Path) -> None:
     assert found["goals achieved"] == "62.5 %"
     assert found["score"] == f"{(26 * 101) ** 0.5 - 1:.2f}"
     text = printed(summary)
-    assert re.search(r"score +50\.24 \(initially 50\.24\)", text)
+    assert re.search(
+        r"score +50\.24 \(initially 50\.24; geometric mean over goals of 1 plus the perc", text
+    )
     assert re.search(r"down +25\.0 % \(initially 25\.0 %\)", text)
     change(lucky / "summary.json", achieved={"down": [0.25, 0.3], "right": [1.0, 1.0]})
     says = r"achieved is 0\.25, 0\.3, 1, 1, but results\.npz gives 0\.25, 0\.25, 1, 1"

@@ -29,6 +29,7 @@ from experiments.store.rows import Row, read_row
 from experiments.store.seals import write_sealed
 from experiments.store.statistics import Interval, PartShare, SeedSpread, compare, same_tasks
 from experiments.store.summary import ADAPT_AGAIN, method_of
+from experiments.store.summary_text import named_goal_rows, sampling_rows
 from experiments.store.tables import number
 
 ENTRY = SCRIPTS / "report.js"
@@ -225,6 +226,7 @@ def _facts(results: Results, row: Row) -> list[tuple[str, str]]:
         ("final return", str(final)),
         ("IQM of the final return [95 % interval]", str(Interval(summary["final_return_iqm"], low, high))),
         ("optimal return", number(summary["optimal_return"])),
+        *_named_figures(summary),
         ("regret", number(summary["regret"])),
         ("regret after 40 episodes", number(summary["regret_after_40"])),
         ("solved optimally", "" if solved is None else f"{100 * solved:.0f} %"),
@@ -239,6 +241,26 @@ def _facts(results: Results, row: Row) -> list[tuple[str, str]]:
         ("versions", ", ".join(f"{n} {v}" for n, v in meta.versions.items() if n in VERSIONS)),
         ("folder", row.folder),
     ]  # fmt: skip
+
+
+NAMED_FIGURES = {
+    "best single episode": "best single episode",
+    "fresh": "fresh",
+    "  minus initial": "fresh minus initial",
+    "score": "score",
+    "goals achieved": "goals achieved",
+}
+"""The rows that worlds have where single episodes are luck or goals have names: their labels in a printed
+summary, and in a page."""
+
+
+def _named_figures(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What a printed summary says of sampled episodes and named goals; empty texts where it says nothing.
+
+    Every run of a page has all of these rows, since the page compares runs row by row.
+    """
+    said = dict(sampling_rows(summary) + named_goal_rows(summary))
+    return [(name, said.get(label, "")) for label, name in NAMED_FIGURES.items()]
 
 
 def _comparison(results: Results, first: Results) -> str:

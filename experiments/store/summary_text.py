@@ -10,9 +10,12 @@ import numpy as np
 from experiments.store.statistics import Interval, PartShare, SeedSpread, mean_log_success
 from experiments.store.tables import block
 
+SCORE = "geometric mean over goals of 1 plus the percentage achieved, minus 1"
+"""What the score is, in words (``statistics.mean_log_success``)."""
 
-def _sampling_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The printed rows on sampled episodes, as label and text; empty in worlds that judge greedily."""
+
+def sampling_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The rows on sampled episodes, as label and text; empty in worlds that judge greedily."""
     if not (fresh := summary.get("fresh")):
         return []
     gain = Interval(fresh["gain"], *(fresh["gain_95"] or ()))
@@ -30,13 +33,19 @@ def _sampling_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def _named_goal_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The printed rows on named goals, as label and text; empty in worlds without names."""
+def named_goal_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The rows on named goals, as label and text; empty in worlds without names.
+
+    The labels of single goals begin with spaces.
+    """
     if not (achieved := summary.get("achieved")):
         return []
     first, last = zip(*achieved.values(), strict=True)
     return [
-        ("score", f"{mean_log_success(last):.2f} (initially {mean_log_success(first):.2f})"),
+        (
+            "score",
+            f"{mean_log_success(last):.2f} (initially {mean_log_success(first):.2f}; {SCORE})",
+        ),
         (
             "goals achieved",
             f"{_mean_percent(last)} of {len(last)} (initially {_mean_percent(first)})",
@@ -81,7 +90,7 @@ def printed(summary: Mapping[str, Any]) -> str:
         shown = "share of searches that did the first k parts (searches with at least k parts)"
         rows.append(("parts in order", shown))
         rows += [(f"  p{k}", str(PartShare(*pair))) for k, pair in enumerate(shares, 1)]
-    rows += _sampling_rows(summary) + _named_goal_rows(summary)
+    rows += sampling_rows(summary) + named_goal_rows(summary)
     if unsolvable := summary.get("unsolvable_tasks"):
         rows.append(
             (
