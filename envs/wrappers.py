@@ -81,6 +81,10 @@ class NoisyState(NamedTuple):
     key: PRNGKeyArray
 
 
+class NoNoiseError(ValueError):
+    """No noise of any size can be applied to what a world has."""
+
+
 @dataclass(frozen=True)
 class Noisy(Wrapper):
     """A world with noise on observations and actions (paper, Table 3).
@@ -114,12 +118,12 @@ class Noisy(Wrapper):
                 f"noise on discrete actions is a probability, found {self.action_noise}"
             )
         if (self.obs_noise or any(self.obs_range)) and not self.env.spec.obs.is_float:
-            raise ValueError(
+            raise NoNoiseError(
                 f"noise on observations needs floating-point observations, those of "
                 f"{self.env.spec.name} are {self.env.spec.obs}"
             )
         if (self.obs_noise or any(self.obs_range)) and self.env.spec.layout is not None:
-            raise ValueError(
+            raise NoNoiseError(
                 "noise on observations needs quantities on a continuous scale, but those of "
                 f"{self.env.spec.name} are codes and counts"
             )
@@ -195,5 +199,6 @@ def noisy(
         try:
             Noisy(env, *sizes)
         except ValueError as error:
-            raise UsageError(f"{name}: {error}; give another size, or leave it out") from None
+            other_size = "" if isinstance(error, NoNoiseError) else "give another size, or "
+            raise UsageError(f"{name}: {error}; {other_size}leave it out") from None
     return Noisy(env, obs_noise, action_noise, obs_range)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -178,10 +179,25 @@ def _ablation_pieces(config: ReproduceConfig) -> Iterator[Piece]:
 
 
 def price_of(training: PretrainConfig) -> float | None:
-    """CPU-seconds of a training at the speed of the released policy's training; None if that is unknown."""
+    """CPU-seconds of a training at the speed of the released policy's training; None if that is unknown.
+
+    The time of a step is taken to be proportional to the size of its batch.
+    """
     place = released_folder(envs.find(training.env), training.method)
     seconds, steps = _seconds_in(place), _steps_in(place)
-    return None if seconds is None or not steps else seconds / steps * training.train.steps
+    if seconds is None or not steps:
+        return None
+    batch = training.train.batch_size
+    return seconds / steps * training.train.steps * batch / (_batch_size_in(place) or batch)
+
+
+def _batch_size_in(folder: Path) -> int | None:
+    """The size of the batches that a released network was trained with; None if that is unknown."""
+    try:
+        document = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+        return int(document["made"]["config"]["train"]["batch_size"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def _seconds_in(folder: Path) -> float | None:

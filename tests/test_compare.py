@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 from envs.errors import UsageError
 from experiments.compare import CompareConfig, main
 from experiments.figures import performance_profiles
+from experiments.pairing import differing
 from experiments.store.result_files import load_results
 from experiments.store.statistics import performance_profile
 
@@ -88,7 +90,15 @@ def test_what_makes_it_unequal_is_said(tmp_path: Path, capsys: pytest.CaptureFix
     main(CompareConfig(runs=(UCB, other)))
     said = capsys.readouterr().err
     assert "warning: the runs have different weights" in said
-    assert f"{other} 000000000000" in said
+    assert f"{other} 000000000000\n" in said
+
+
+def test_only_hashes_are_cut() -> None:
+    """Names of worlds are written out, since their first letters may be the same."""
+    plan = load_results(PLAN)
+    other = replace(plan, summary={**plan.summary, "env": "maze15-with-doors"})
+    (said,) = differing([PLAN, UCB], [plan, other])
+    assert said == f"the runs have different worlds: {PLAN} maze15, {UCB} maze15-with-doors"
 
 
 def test_a_profile_is_the_share_of_scores_above_each_threshold() -> None:

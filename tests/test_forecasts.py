@@ -9,6 +9,7 @@ import pytest
 
 from envs.errors import UsageError
 from experiments import adapt, pretrain
+from experiments.inventory import price_of
 from experiments.parsing import parse
 from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.presets import pretrain_default
@@ -80,6 +81,17 @@ def test_a_training_that_goes_on_from_a_policy_tells_its_schedule(
     (said,) = [line for line in capsys.readouterr().err.splitlines() if "schedule" in line]
     assert said.startswith("schedule: 1,000 gradient steps of ")
     assert "the learning rate rises to 0.001 within " in said
+
+
+def test_a_training_costs_as_much_as_its_batches_are_large() -> None:
+    """The released policy of ``crafter`` learned from larger batches than the preset has."""
+    costs = {}
+    for env, size in (("maze15", 64), ("maze15", 32), ("crafter", 16), ("crafter", 32)):
+        words = ["--env", env, "--steps", "8000", "--batch-size", str(size)]
+        costs[env, size] = price_of(parse(PretrainConfig, words, pretrain_default))
+    assert costs["maze15", 32] == pytest.approx(costs["maze15", 64] / 2)
+    assert costs["crafter", 16] == pytest.approx(costs["crafter", 32] / 2)
+    assert costs["crafter", 32] == pytest.approx(8_000 * 2.176, rel=1e-3)
 
 
 def test_a_training_is_only_counted(

@@ -159,6 +159,9 @@ def test_codes_take_no_noise():
         match="needs quantities on a continuous scale, but those of echo are codes and counts",
     ):
         Noisy(Coded(), obs_noise=0.1)
+    # No size is possible, so that another one is not asked for.
+    with pytest.raises(UsageError, match=r"--obs-noise: .* are codes and counts; leave it out$"):
+        behind_noise(Coded(), 0.1)
 
 
 def test_whole_numbers_take_no_noise():

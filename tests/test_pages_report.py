@@ -88,6 +88,15 @@ def test_an_address_without_a_run_is_of_the_first_run() -> None:
 
 
 @needs_node
+@pytest.mark.parametrize("optimum", [None, [1.0, 2.25]])
+def test_the_line_of_the_optimum_is_named_where_there_is_one(optimum: list[float] | None) -> None:
+    data = report_of(run_data("one", "#0072b2", [1, 2]), optimum=optimum)
+    said = in_report(data, """await report.main([null], data); return $("returns").textContent;""")
+    assert ("Dashed line: optimum. Click" in said) == (optimum is not None)
+    assert "Large: this episode. " in said
+
+
+@needs_node
 def test_a_browser_that_refuses_new_addresses_stops_nothing() -> None:
     """Safari and Firefox throw after some calls. They are not called for each of many quick steps."""
     data = report_of(run_data("one", "#0072b2", [1, 2]))

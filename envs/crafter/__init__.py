@@ -140,14 +140,14 @@ CRAFTER_MAP = replace(
     CRAFTER_SYMBOLIC,
     name="crafter-map",
     make=make_map,
-    summary="crafter-symbolic, where goals also say at which place their achievements were unlocked",
+    summary="22 achievements in a generated world, seen as codes; goals also say where they were unlocked",
 )
 
 CRAFTER = replace(
     CRAFTER_SYMBOLIC,
     name="crafter",
     make=make_seen,
-    summary="crafter-symbolic for policies that see Crafter's picture of 64 x 64 pixels",
+    summary="22 achievements in a generated world, seen as Crafter's picture of 64 x 64 pixels",
     # Datasets hold the codes from which the picture is drawn; the encoder computes with the picture.
     presets={name: {**preset, "encoder": "crafter-picture"} for name, preset in PRESETS.items()},
 )

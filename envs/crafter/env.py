@@ -1,6 +1,6 @@
 """Crafter: 22 achievements in a world that is generated from a seed (Hafner, 2022).
 
-Source: paper, appendix C.5, with Craftax-Classic in place of the Python program (``rules.py``). A task is
+Source: paper, appendix C.4, with Craftax-Classic in place of the Python program (``rules.py``). A task is
 the seed of a world; the mobs behave randomly in each episode. The reward is 1 when an achievement is
 unlocked for the first time, and plus or minus 0.1 for every point of health gained or lost. A goal is one
 achievement; the task goal is all of them.

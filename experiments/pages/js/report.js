@@ -366,7 +366,7 @@ class Report {
     ...values.map((value, e) => svg("circle", {
       cx: x(e), cy: y(value), r: e === episode ? 7 : 3.4, fill: isGreedy(e) || e === episode ? log.color : "none", stroke: log.color, "stroke-width": 1.3,
     })));
-    return element("div", {}, drawing, element("p", { class: "quiet" }, "Filled: greedy actions. Open: sampled actions. Large: this episode. Dashed line: optimum. Click to choose an episode."));
+    return element("div", {}, drawing, element("p", { class: "quiet" }, `Filled: greedy actions. Open: sampled actions. Large: this episode. ${optimum === undefined ? "" : "Dashed line: optimum. "}Click to choose an episode.`));
   }
 
   showKnown() {
