@@ -15,20 +15,25 @@ from crafter import objects  # noqa: E402
 
 from envs.crafter import rules  # noqa: E402
 from envs.crafter.env import Crafter, CrafterTask  # noqa: E402
+from envs.crafter.official import (  # noqa: E402
+    BLOCK_OF,
+    FACINGS,
+    CrafterEpisode,
+    codes_of,
+    observation_of,
+)
 from envs.crafter.tiles import agent_picture  # noqa: E402
 from envs.crafter.view import (  # noqa: E402
     ACHIEVEMENTS,
     ACTIONS,
     BLOCKS,
-    COLUMNS,
     COUNTS,
     MOBS,
-    NUM_BLOCKS,
     NUM_CELLS,
-    NUM_MOBS,
     ROWS,
     observe,
 )
+from envs.official import play as play_by_hand  # noqa: E402
 
 ENV = Crafter(name="crafter-symbolic", horizon=500)
 SIDE, CENTER = 64, 32
@@ -36,9 +41,6 @@ LETTERS = {
     ".": "sand", "g": "grass", "~": "water", "#": "stone", "T": "tree", "_": "path", "c": "coal",
     "i": "iron", "d": "diamond", "t": "table", "f": "furnace", "L": "lava",
 }  # fmt: skip
-OFFICIAL_NAME = {"crafting_table": "table", "plant": "grass", "ripe_plant": "grass"}
-BLOCK_OF = {OFFICIAL_NAME.get(name, name): place for place, name in reversed([*enumerate(BLOCKS)])}
-FACINGS = ((-1, 0), (1, 0), (0, -1), (0, 1))  # (x, y) of west, east, north, south
 MOB_CLASSES = (None, objects.Zombie, objects.Cow, objects.Skeleton)
 PICTURE = jax.jit(agent_picture)
 START, _ = jax.jit(ENV.reset)(jax.random.key(0), CrafterTask(jnp.uint32(0)))
@@ -120,16 +122,11 @@ class Both:
 
     def compare(self, obs):
         """What the program here shows is what there is in Crafter."""
-        world, player = self.theirs._world, self.theirs._player
-        counts = dict(zip(COUNTS, obs[NUM_CELLS:].astype(int), strict=False))
-        assert counts == player.inventory
-        assert np.argmax(obs[NUM_CELLS + 16 :][:4]) == FACINGS.index(tuple(player.facing))
-        np.testing.assert_allclose(obs[-2], world.daylight, atol=1e-6)
-        assert bool(obs[-1]) == player.sleeping
+        player = self.theirs._player
         np.testing.assert_array_equal(
             np.asarray(self.mine.world.player_position), [player.pos[1], player.pos[0]]
         )
-        np.testing.assert_array_equal(obs[:NUM_CELLS].reshape(ROWS, COLUMNS), codes_of(self.theirs))
+        np.testing.assert_allclose(obs, observation_of(self.theirs), atol=1e-6)
 
 
 class Dice:
@@ -140,23 +137,6 @@ class Dice:
 
     def uniform(self):
         return self._number
-
-
-def codes_of(env):
-    """The cell codes of what Crafter has in view, ``[7, 9]``."""
-    world, (x, y) = env._world, env._player.pos
-    codes = np.zeros((ROWS, COLUMNS), int)
-    for row, column in np.ndindex(ROWS, COLUMNS):
-        material, thing = world[x + column - COLUMNS // 2, y + row - ROWS // 2]
-        code = BLOCKS.index("out_of_bounds") if material is None else BLOCK_OF[material]
-        if isinstance(thing, objects.Plant):
-            code = BLOCKS.index("ripe_plant" if thing.ripe else "plant")
-        if isinstance(thing, objects.Arrow):
-            code += NUM_BLOCKS * NUM_MOBS * (1 + FACINGS.index(tuple(thing.facing)))
-        elif type(thing) in MOB_CLASSES[1:]:
-            code += NUM_BLOCKS * MOB_CLASSES.index(type(thing))
-        codes[row, column] = code
-    return codes
 
 
 def drawn(text):
@@ -389,6 +369,35 @@ def test_random_play(seed):
     plants = np.isin(np.asarray(both.mine.world.map), (15, 16))
     mine = np.where(plants, BLOCKS.index("grass"), np.asarray(both.mine.world.map))
     np.testing.assert_array_equal(mine, numbers)
+
+
+class Wanderer:
+    """Takes random actions, and keeps what it has seen."""
+
+    def __init__(self):
+        self.rng, self.seen = np.random.default_rng(0), []
+
+    def act(self, obs):
+        self.seen.append(obs)
+        return np.asarray(self.rng.integers(len(ACTIONS)))
+
+    reset = act
+
+
+def test_an_episode_of_the_package_is_played_by_hand():
+    wanderer = Wanderer()
+    played = play_by_hand(wanderer, CrafterEpisode(seed=1, horizon=120))
+    assert played.length == len(wanderer.seen) == 120
+    first, last = wanderer.seen[0], wanderer.seen[-1]
+    assert first.shape == ENV.spec.obs.shape
+    assert first.dtype == np.float32
+    assert first[NUM_CELLS:][COUNTS.index("health")] == 9
+    assert (last[:NUM_CELLS] != first[:NUM_CELLS]).any()
+    assert set(played.reached) <= set(ACHIEVEMENTS)
+    assert len(set(played.reached)) == len(played.reached) > 0
+    lost = round(10 * (len(played.reached) - played.return_), 6)
+    assert lost == int(lost)  # what is not an achievement is points of health
+    assert 0 <= lost < 9
 
 
 class TestPictures:

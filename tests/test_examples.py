@@ -15,6 +15,7 @@ import pytest
 
 import envs
 from envs.episodes import run_episode
+from envs.official import Played
 from envs.registry import World
 from mgpo_jax.dataset import load_dataset
 
@@ -127,6 +128,22 @@ def test_a_place_far_from_the_start_is_told_from_near_ones() -> None:
     trajectory = SimpleNamespace(goal_reached=achieved.any(axis=-1), achieved_goals=achieved)
     found = places.arrivals(SimpleNamespace(trajectory=trajectory), goal)
     np.testing.assert_allclose(found, (1 / 3, 2 / 3))
+
+
+def test_what_the_policy_reached_in_crafter_itself_is_told() -> None:
+    pytest.importorskip("craftax")
+    itself = importlib.import_module("examples.crafter_itself")
+    found = [
+        Played(("wood", "coal"), (3, 9), 1.5, 20),
+        Played(("wood",), (8,), 0.5, 12),
+    ]
+    text = itself.report(found, ("wood", "coal", "iron"), horizon=20)
+    lines = [line.strip("| ").split(" | ") for line in text.splitlines()]
+    told = {words[0]: words[1] for words in lines if len(words) == 2}
+    assert told["return, mean ± standard error"] == "1.00 ± 0.50"
+    assert told["died before the horizon"] == "50 %"
+    assert (told["wood"], told["coal"], told["iron"]) == ("100 %", "50 %", "0 %")
+    assert told["achieved"] == "50.0 %"
 
 
 def test_the_large_data_are_a_dataset_and_the_guide_has_their_training(tmp_path: Path) -> None:

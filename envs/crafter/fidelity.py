@@ -22,6 +22,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from envs.base import Agent
 from envs.crafter.env import Crafter, CrafterState, CrafterTask
+from envs.crafter.official import import_crafter
 from envs.crafter.rules import new_world
 from envs.crafter.view import BLOCKS, COLUMNS, MAX_COUNT, NUM_ACTIONS, NUM_CELLS, ROWS
 from envs.episodes import run_episode
@@ -47,19 +48,6 @@ class FidelityConfig:
     """Number of simultaneous episodes of a random agent whose speed is measured."""
 
 
-def official() -> Any:
-    """Import the Python package ``crafter``.
-
-    Raises:
-      UsageError: if it is missing.
-    """
-    try:
-        import crafter
-    except ImportError as error:
-        raise UsageError(f"{error}; pip install crafter==1.8.3 opensimplex") from None
-    return crafter
-
-
 def shares_here(num_worlds: int) -> dict[str, float]:
     """The fraction of each kind of block in the maps of this world."""
     seeds = jnp.arange(num_worlds, dtype=jnp.uint32)
@@ -73,7 +61,7 @@ def shares_in_crafter(num_worlds: int) -> dict[str, float]:
     """The fraction of each kind of block in the maps of the package."""
     found: Counter[str] = Counter()
     for seed in range(num_worlds):
-        env = official().Env(seed=seed)
+        env = import_crafter().Env(seed=seed)
         env.reset()
         names = env._world._mat_names
         kinds, counts = np.unique(env._world._mat_map, return_counts=True)
@@ -109,10 +97,13 @@ def seen_here(num_walks: int, num_steps: int) -> Float[np.ndarray, "T mobs"]:
 
 def seen_in_crafter(num_walks: int, num_steps: int) -> Float[np.ndarray, "T mobs"]:
     """The same numbers as ``seen_here``, in the package."""
-    objects = official().objects
+    objects = import_crafter().objects
     found = np.zeros((num_walks, num_steps, len(MOBS_TOLD)))
     for seed in range(num_walks):
-        env, rng = official().Env(length=num_steps + 1, seed=seed), np.random.default_rng(seed)
+        env, rng = (
+            import_crafter().Env(length=num_steps + 1, seed=seed),
+            np.random.default_rng(seed),
+        )
         env.reset()
         for time_ in range(num_steps):
             env.step(int(rng.integers(MOVES.start, MOVES.stop)))
