@@ -18,7 +18,7 @@ from test_architecture import call_without_jax
 import envs.kitchen
 from envs.errors import DataError, MissingExtraError, UsageError
 from envs.registry import WORLDS
-from examples import over_time
+from examples import achieved, over_time
 from experiments.store.paper import paper_final
 from experiments.store.result_files import load_results, save_results
 from experiments.store.results import Results
@@ -189,6 +189,13 @@ def test_the_published_tables_over_time_are_those_of_the_results(
         folders = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=True)
         over_time.main([ROOT / folder for folder in folders.stdout.split()])
         assert capsys.readouterr().out == wanted
+
+
+def test_the_published_table_of_achievements_is_that_of_the_results() -> None:
+    """It stands below the command that prints it."""
+    text = (ROOT / "docs/results.md").read_text()
+    ((words, shown),) = re.findall(r"    python -m examples.achieved (.+)\n\n((?:\|.*\n)+)", text)
+    assert achieved.achieved_table([ROOT / run for run in words.split()]) + "\n" == shown
 
 
 def test_a_table_needs_no_jax(with_parts: Path) -> None:
