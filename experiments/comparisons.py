@@ -363,17 +363,21 @@ def compare(config: ReproduceConfig) -> Compared:
     text = f"{table_of(config).title}\n\n{as_table(found, config.scale)}"
     place.parent.mkdir(parents=True, exist_ok=True)
     write_sealed(place, lambda path: path.write_text(text, encoding="utf-8"))
-    curves = _curves(found)
+    curves = _curves(found, table_of(config).methods)
     if curves:
         write(picture, later(learning_curves, curves))
     return Compared(text, [f"{cell.method} in {cell.world}" for cell in found if cell.failed])
 
 
-def _curves(found: Sequence[Cell]) -> dict[str, dict[str, Any]]:
-    """The results that have learning curves, by world and method."""
+def _curves(found: Sequence[Cell], of_paper: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """The results in a figure of learning curves, by world and method.
+
+    Those are of methods that learn, and of the paper's methods that do not, but not of our references.
+    """
     curves: dict[str, dict[str, Any]] = {}
     for cell in found:
-        if cell.results is not None and methods.find(cell.method).learns:
+        shown = methods.find(cell.method).learns or cell.method in of_paper
+        if cell.results is not None and shown:
             curves.setdefault(cell.world, {})[cell.method] = load_results(cell.results)
     return curves
 

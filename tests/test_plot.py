@@ -212,6 +212,31 @@ def test_learning_curve_is_mean_over_tasks_and_std_over_seeds():
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("episodes", "evaluation return")
 
 
+def test_panels_of_many_worlds_lie_in_rows_of_three():
+    worlds = {f"world{index}": {"ucb": fake_results()} for index in range(4)}
+    figure = figures.learning_curves(worlds)
+    drawn = [ax for ax in figure.axes if ax.axison]
+    assert [ax.get_title() for ax in drawn] == list(worlds)
+    places = [ax.get_subplotspec() for ax in drawn]
+    assert [(at.rowspan.start, at.colspan.start) for at in places] == [
+        (0, 0),
+        (0, 1),
+        (0, 2),
+        (1, 0),
+    ]
+    assert [ax.get_ylabel() != "" for ax in drawn] == [True, False, False, True]
+    assert figure.get_figwidth() == pytest.approx(7.5)
+
+
+def test_what_learns_nothing_is_a_line_over_the_whole_width():
+    still = replace(fake_results("gcbc"), eval_episodes=np.array([0, 1]), num_episodes=1)
+    (ax,) = figures.learning_curve({"gcbc": still, "plan": fake_results("plan")}).axes
+    lines = {line.get_label(): line for line in ax.lines}
+    assert lines["GC-BC"].get_xdata() == [0, 1]  # shares of the width
+    np.testing.assert_allclose(lines["GC-BC"].get_ydata(), -0.25)
+    assert len(lines) == 3  # the optimum, too
+
+
 def test_no_line_of_an_unknown_optimum():
     unknown = replace(fake_results(), optimal_returns=np.full(2, np.nan))
     (ax,) = figures.learning_curve({"ucb": unknown}).axes

@@ -15,6 +15,7 @@ from experiments.store.statistics import performance_profile
 if TYPE_CHECKING:
     from experiments.store.results import Results
 
+IN_A_ROW = 3  # panels beside each other, so that their text is legible on a page
 RETURN = "evaluation return"
 """Label of the return in evaluation episodes, of an optimized prompt or of a learned policy."""
 
@@ -24,7 +25,7 @@ def learning_curve(results: Mapping[str, Results], title: str | None = None) -> 
     """Figures 6 and 7: return of the optimized prompt, or of the learned policy, over the episodes.
 
     Lines are means over tasks and seeds, bands the standard deviation over seeds. The optimum is drawn if
-    it is known.
+    it is known. An adaptation of a single episode is a line at its return.
     """
     figure = Figure(figsize=(4.8, 2.7), layout="constrained")
     _draw_curves(figure.add_subplot(), results, title)
@@ -35,18 +36,22 @@ def learning_curve(results: Mapping[str, Results], title: str | None = None) -> 
 @styled
 def learning_curves(results: Mapping[str, Mapping[str, Results]]) -> Figure:
     """Figures 6 and 7 as a whole: a panel of learning curves for each world, with one legend."""
-    figure = Figure(figsize=(2.5 * len(results), 2.6), layout="constrained")
-    panels = figure.subplots(1, len(results), squeeze=False)[0]
-    for ax, (world, of_world) in zip(panels, results.items(), strict=True):
+    columns = min(IN_A_ROW, len(results))
+    rows = -(-len(results) // columns)
+    figure = Figure(figsize=(2.5 * columns, 2.2 * rows + 0.7), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for index, (ax, (world, of_world)) in enumerate(zip(panels, results.items(), strict=False)):
         _draw_curves(ax, of_world, world)
-        ax.set_ylabel("" if ax is not panels[0] else RETURN)
+        ax.set_ylabel(RETURN if index % columns == 0 else "")
+    for ax in panels[len(results) :]:
+        ax.set_axis_off()
     entries = {
         label: line
         for ax in panels
         for line, label in zip(*ax.get_legend_handles_labels(), strict=True)
     }
     figure.legend(
-        entries.values(), entries.keys(), loc="outside lower center", ncols=2 * len(results)
+        entries.values(), entries.keys(), loc="outside lower center", ncols=min(4, 2 * columns)
     )
     return figure
 
@@ -57,6 +62,11 @@ def _draw_curves(ax: Any, results: Mapping[str, Results], title: str | None) -> 
         by_seed = result.eval_returns.mean(axis=1)
         mean, std = by_seed.mean(axis=0), by_seed.std(axis=0)
         episodes = result.eval_episodes
+        if (
+            episodes[-1] == 1
+        ):  # enough for a method that learns nothing: a line over the whole width
+            ax.axhline(mean[-1], label=name, color=color, linestyle=line)
+            continue
         ax.plot(
             episodes, mean, label=name, color=color, linestyle=line, marker=marker,
             markeredgecolor="white", markeredgewidth=0.6,

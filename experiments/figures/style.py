@@ -73,6 +73,7 @@ METHODS = {
         "explore": ("#009E73", "-", "^"),
         "grips": ("#CC79A7", "--", "D"),
         "bbt": ("#56B4E9", "--", "v"),
+        "plan": ("#E69F00", "-", "X"),
         "gcbc": ("#6B6B6B", ":", "P"),
         "ppo": ("#8C510A", "-.", "v"),
         "ppo-careful": ("#C49A6C", "-.", "^"),
@@ -88,7 +89,7 @@ METHODS = {
     }.items()
 }
 # For methods without a look of their own: all colors with solid lines, then all with dashed ones.
-SPARE_COLORS = ("#E69F00", "#A65628", "#7570B3", "#E7298A", "#1B7837", "#4D4D4D")
+SPARE_COLORS = ("#8A8A00", "#A65628", "#7570B3", "#E7298A", "#1B7837", "#4D4D4D")
 SPARE_STYLES = [
     (color, line, marker)
     for line in ("-", "--")
