@@ -25,9 +25,10 @@ def paper_rows(table: str, world: str) -> dict[str, Any]:
 
 
 def paper_worlds(table: str) -> tuple[str, ...]:
-    """The worlds in a table or figure of the paper, in its order."""
+    """The worlds in a table or figure of the paper, in its order, and ours that stand beside them."""
     numbers = _numbers()
-    return tuple(numbers.get(table, numbers["figures"].get(table, ())))
+    of_paper = numbers.get(table, numbers["figures"].get(table, ()))
+    return (*of_paper, *numbers["beside"].get(table, ()))
 
 
 METHODS_IN = ("table2", "table1", "table8")
