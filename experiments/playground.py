@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import NoReturn
 
 from envs.errors import UsageError, printable
-from experiments.report import check_page
 from experiments.runtime import Common, run
+from experiments.store.seals import check_page
 from experiments.store.settings import DEFAULT_WORLD
 from mgpo_jax.settings import Name
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,9 +11,9 @@ from typing import NoReturn
 import tyro
 
 import envs
-from envs.errors import UsageError, printable
-from experiments.runtime import Common, require_parent, require_runs, run
-from mgpo_jax.claims import check_place
+from envs.errors import printable
+from experiments.runtime import Common, require_runs, run
+from experiments.store.seals import check_page
 from mgpo_jax.settings import Name
 
 
@@ -44,18 +43,6 @@ def main(config: ReportConfig) -> None:
 
     write_report(config.runs, config.out, config.pictures)
     print(printable(str(config.out)), file=sys.stderr)
-
-
-def check_page(out: Path) -> None:
-    """Raise ``UsageError`` if the page cannot be written to a file, or would overwrite another file."""
-    from experiments.store.seals import check_replaceable
-
-    require_parent(out, "--out")
-    if not os.path.lexists(out):
-        check_place(out)
-    if out.suffix != ".html":
-        raise UsageError(f"--out {out} must end in .html")
-    check_replaceable([out], "choose another file with --out")
 
 
 def command(argv: Sequence[str] | None = None) -> NoReturn:

@@ -304,6 +304,18 @@ def test_commands_are_short() -> None:
         assert len(path.read_text().splitlines()) < COMMAND_LINES, name
 
 
+def test_no_command_imports_another() -> None:
+    """What commands share is in the modules beside them."""
+    commands = {f"experiments.{name}" for name in COMMANDS}
+    faults = [
+        f"{module}:{line} imports {name}"
+        for module in sorted(commands)
+        for line, name in imported(sources()[module], module, False)
+        if any(is_within(name, other) for other in commands - {module})
+    ]
+    assert faults == []
+
+
 WITHOUT_JAX = """
 import contextlib, io, sys
 

@@ -14,6 +14,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from envs.errors import UsageError
+from experiments.runtime import require_parent
+from mgpo_jax.claims import check_place
 from mgpo_jax.files import written
 
 _LABEL = "mgpo_jax, sha256 of the rest: "
@@ -77,6 +79,16 @@ def check_replaceable(paths: Iterable[Path], *ways_out: str) -> None:
             f"{', '.join(foreign[:3])}{more} would be overwritten, but was not written by this command or "
             f"was changed since; {', or '.join(('move it away', *ways_out))}"
         )
+
+
+def check_page(out: Path) -> None:
+    """Raise ``UsageError`` if a page cannot be written to a file, or would overwrite a foreign file."""
+    require_parent(out, "--out")
+    if not os.path.lexists(out):
+        check_place(out)
+    if out.suffix != ".html":
+        raise UsageError(f"--out {out} must end in .html")
+    check_replaceable([out], "choose another file with --out")
 
 
 def _is_ours(path: Path) -> bool:
