@@ -53,8 +53,11 @@ class Joined(Common):
     """Index of this process, counted from 0."""
 
 
-OF_PROCESSES = tuple(field.name for field in dataclasses.fields(Joined))[-4:]
-"""The settings above, which do not affect results."""
+_SHARED = {field.name for field in dataclasses.fields(Common)}
+OF_PROCESSES = tuple(
+    field.name for field in dataclasses.fields(Joined) if field.name not in _SHARED
+)
+"""The settings of ``Joined`` alone, which do not affect results."""
 
 
 def check_flags(config: Joined) -> None:

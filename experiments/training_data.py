@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -97,7 +97,8 @@ def prepare_dataset(
         text = f"no dataset in {folder} yet: {wanted.trajectories} trajectories are collected first"
         print(text, file=sys.stderr)
         # A single process may find that another command has just collected it; that is fine, too.
-        with suppress(*[ExistsError] * (processes.count() == 1)):
+        alone = processes.count() == 1
+        with suppress(ExistsError) if alone else nullcontext():
             collect_and_save(replace(wanted, resume=True), True, go_on)
         processes.exchange(b"")  # wait until every process can see it
     made = {
