@@ -15,7 +15,7 @@ from typing import Any, get_args
 from envs.errors import DataError, UsageError, shown
 from experiments.joining import OF_PROCESSES
 from mgpo_jax.schema import Json, read_document
-from mgpo_jax.settings import flag, is_settings, types_of
+from mgpo_jax.settings import flag, flag_off, is_settings, types_of
 
 OWN = frozenset({"config", "debug", "dry_run", "json", "out", "quiet", "resume", *OF_PROCESSES})
 """Settings that belong to a single call of a command and are not taken from a file."""
@@ -160,7 +160,7 @@ def _check_setting(name: str, value: Any, setting: str) -> None:
 def _words(name: str, value: Any) -> list[str]:
     """A setting as words of a command line."""
     if isinstance(value, bool):
-        return [flag(name) if value else flag(f"no_{name}")]
+        return [flag(name) if value else flag_off(name)]
     if isinstance(value, Sequence) and not isinstance(value, str):
         return [flag(name), *map(str, value)] if value else []
     return [f"{flag(name)}={value}"]

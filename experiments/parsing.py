@@ -33,7 +33,7 @@ from tyro.constructors import (
 
 from envs.errors import UsageError, shown
 from experiments.config_files import expanded
-from mgpo_jax.settings import check_values, flag, is_settings, range_of, types_of
+from mgpo_jax.settings import check_values, flag, flag_off, is_settings, range_of, types_of
 
 Defaults = Callable[[Any, Sequence[str]], Any]
 """``(config, flags) -> default config``. The config has the values that were typed and general defaults
@@ -153,7 +153,7 @@ def _flags(config: Any) -> dict[str, str]:
                 own,
             )
             if isinstance(value, bool):
-                more[own.replace("--", "--no-", 1)] = own
+                more[flag_off(field.name)] = own
         if twice := found.keys() & more.keys():
             raise UsageError(f"two settings have the flag {min(twice)}; rename one of them")
         found |= more
@@ -172,7 +172,7 @@ def _check_flags(words: Sequence[str], known: dict[str, str]) -> None:
             continue
         if own in seen:
             raise UsageError(f"{own} is given twice; leave one of them out")
-        if "=" in word and own.replace("--", "--no-", 1) in known:
+        if "=" in word and flag_off(own.removeprefix("--")) in known:
             raise UsageError(f"{own} takes no value, found {shown(word.partition('=')[2])}")
         seen.add(own)
 

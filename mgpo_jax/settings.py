@@ -74,6 +74,11 @@ def flag(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
+def flag_off(name: str) -> str:
+    """The flag that switches a setting off."""
+    return flag(f"no_{name}")
+
+
 @cache
 def types_of(settings_class: type) -> dict[str, Any]:
     """The types of the settings of a dataclass, with their ranges."""
@@ -166,7 +171,7 @@ def check_contradictions(
     """
     for name, value in given.items():
         if name in network and value not in (None, network[name]):
-            switch = flag(name) if value else flag(name).replace("--", "--no-", 1)
+            switch = flag(name) if value else flag_off(name)
             wanted = switch if isinstance(value, bool) else f"{flag(name)} {shown(value)}"
             found = f"{name} {shown(network[name])}"
             raise UsageError(f"{wanted} contradicts {where}, whose network has {found}; {mend}")

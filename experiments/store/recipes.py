@@ -10,7 +10,7 @@ from typing import Any
 
 from experiments.store.settings import PretrainConfig
 from mgpo_jax.manifest import Facts
-from mgpo_jax.settings import flag
+from mgpo_jax.settings import flag, flag_off
 
 PASSES = 20  # epochs: how often a training sees each trajectory
 SMALL, LARGE = (
@@ -75,7 +75,7 @@ def told(config: PretrainConfig, facts: Facts) -> str:
 
 def _as_flag(name: str, value: Any) -> str:
     if isinstance(value, bool):
-        return flag(name) if value else flag(name).replace("--", "--no-", 1)
+        return flag(name) if value else flag_off(name)
     return f"{flag(name)} {value}"
 
 
