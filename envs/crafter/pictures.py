@@ -68,7 +68,7 @@ def crafter_pictures(env: Crafter) -> Pictures:
     them."""
     if env.pixels:
         return Pictures(frame=np.asarray)
-    return Pictures(episodes=draw_episodes, video=write_video, panel=(3.1, 5.7))
+    return Pictures(episodes=draw_episodes, video=write_video, panel=(3.1, 6.0))
 
 
 def draw_episodes(
@@ -252,6 +252,7 @@ def draw_bar(
     ax.set(xlim=(0, length), ylim=(max(len(unlocked), 8) + 0.6, 0.4), yticks=[], xlabel="step")
     ax.tick_params(labelsize=6)
     ax.xaxis.label.set_fontsize(6)
+    ax.xaxis.labelpad = 1
     ax.set_axisbelow(True)
     for side in ("top", "right", "left"):
         ax.spines[side].set_visible(False)
