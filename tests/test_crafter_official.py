@@ -100,6 +100,30 @@ class Both:
             )
         self.mine = START._replace(world=mine, health=mine.player_health)
 
+    def shoot(self, place, facing):
+        """Put an arrow at a place (row, column), which flies to the side that ``facing`` names."""
+        row, column = place
+        x, y = FACINGS[ACTIONS.index(facing) - 1]
+        arrow = objects.Arrow(self.theirs._world, (column, row), (x, y))
+        self.theirs._world.add(arrow)
+        world = self.mine.world
+        arrows = world.arrows.replace(
+            position=world.arrows.position.at[0].set(jnp.array([row, column])),
+            mask=world.arrows.mask.at[0].set(True),
+        )
+        directions = world.arrow_directions.at[0].set(jnp.array([y, x]))
+        world = world.replace(arrows=arrows, arrow_directions=directions)
+        self.mine = self.mine._replace(world=world)
+
+    def disarm(self):
+        """Let skeletons wait with their next arrow for longer than any test."""
+        for thing in self.theirs._world.objects:
+            if isinstance(thing, objects.Skeleton):
+                thing.reload = 100
+        skeletons = self.mine.world.skeletons
+        waiting = skeletons.replace(attack_cooldown=jnp.full_like(skeletons.attack_cooldown, 100))
+        self.mine = self.mine._replace(world=self.mine.world.replace(skeletons=waiting))
+
     def step(self, name):
         """The same action in both; what they then say must be the same. Returns my time step."""
         action = ACTIONS.index(name)
@@ -298,12 +322,16 @@ PEN = """
 
 
 @pytest.mark.parametrize("sword", ["none", "wood_sword", "stone_sword", "iron_sword"])
-@pytest.mark.parametrize(("mob", "unlocks"), [("cow", "eat_cow"), ("zombie", "defeat_zombie")])
+@pytest.mark.parametrize(
+    ("mob", "unlocks"),
+    [("cow", "eat_cow"), ("zombie", "defeat_zombie"), ("skeleton", "defeat_skeleton")],
+)
 def test_fights(mob, unlocks, sword):
     """A mob that is penned in, in front of the agent."""
     swords = {} if sword == "none" else {sword: 2}  # a second one does not count
     both = Both(drawn(PEN), [(mob, (CENTER - 1, CENTER))], food=3, **swords)
-    health = {"cow": 3, "zombie": 5}[mob]
+    both.disarm()  # when skeletons shoot is another rule in both programs
+    health = {"cow": 3, "zombie": 5, "skeleton": 3}[mob]
     hits = -(-health // {"none": 1, "wood_sword": 2, "stone_sword": 3, "iron_sword": 5}[sword])
     # The zombie hits first, and again after some steps.
     assert play(both, "up", f"do {hits}") == [unlocks]
@@ -319,6 +347,33 @@ def test_zombies_hurt(asleep):
     assert not bool(both.mine.world.is_sleeping)
     if not asleep:  # or the second blow ends it
         play(both, "noop 4")
+
+
+@pytest.mark.parametrize("asleep", [False, True])
+@pytest.mark.parametrize("facing", ["left", "right", "up", "down"])
+def test_arrows_hurt(facing, asleep):
+    both = Both(np.full((SIDE, SIDE), "sand", dtype="<U8"), energy=5)
+    if asleep:
+        play(both, "sleep")
+    x, y = FACINGS[ACTIONS.index(facing) - 1]
+    both.shoot((CENTER - 3 * y, CENTER - 3 * x), facing)
+    assert play(both, "noop 2") == []
+    assert int(both.mine.world.player_health) == 9
+    assert bool(both.mine.world.is_sleeping) == asleep
+    # The third step hits, and wakes who sleeps, which is no achievement.
+    assert play(both, "noop 4") == []
+    assert int(both.mine.world.player_health) == 7
+    assert not bool(both.mine.world.is_sleeping)
+
+
+@pytest.mark.parametrize("target", list(LETTERS))
+def test_what_arrows_do_to_what_they_hit(target):
+    """They fly over water and lava, and turn tables and furnaces into paths."""
+    both = Both(drawn(f"@...{target}.#"))
+    both.shoot((CENTER, CENTER + 2), "right")
+    play(both, "noop 7")
+    block = BLOCKS[int(both.mine.world.map[CENTER, CENTER + 4])]
+    assert (block == "path") == (target in "tf_")
 
 
 def test_mobs_trample_plants_down():
