@@ -15,7 +15,7 @@ from envs.base import Environment, Task
 from envs.errors import UsageError
 from envs.registry import World
 from experiments.joining import OF_PROCESSES
-from experiments.runtime import expect_compiling
+from experiments.runtime import Compiling
 from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.layout import META
 from experiments.store.policies import check_weights, far_prompts
@@ -33,7 +33,13 @@ from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.runner import sweep
 from mgpo_jax.schema import Json, read_document
 from mgpo_jax.seen_goals import warning_of_goals
-from mgpo_jax.tasks import evaluation_tasks, load_tasks, task_arrays, test_tasks
+from mgpo_jax.tasks import (
+    evaluation_tasks,
+    load_tasks,
+    num_tasks,
+    task_arrays,
+    test_tasks,
+)
 
 
 def chosen_tasks(
@@ -44,6 +50,20 @@ def chosen_tasks(
         num = world.num_test_tasks
         return evaluation_tasks(env, num, num, seed=validation_seed)
     return load_tasks(path, env) if path is not None else test_tasks(world)
+
+
+def _compiling(configs: Sequence[AdaptConfig], policy: LoadedPolicy, tasks: Task) -> Compiling:
+    """What decides the programs of some adaptations, for the announcement that they are compiled."""
+    first = configs[0]
+    facts = {
+        "command": "adapt",
+        "env": first.env,
+        "method": first.method,
+        "noise": [first.obs_noise, first.action_noise],
+        "network": to_json(policy.config),
+        "lanes": [len(configs), first.seeds, num_tasks(tasks)],
+    }
+    return Compiling(f"{first.method} in {first.env}", facts)
 
 
 def adapt_all(
@@ -63,15 +83,17 @@ def adapt_all(
         {name: value for name, value in deciding(first, policy, tasks).items() if "sha256" in name}
     )
 
+    compiling = _compiling(configs, policy, tasks)
+
     def begin() -> None:
         if processes.is_first():
             warn_of_goals(env, policy, tasks)
-        expect_compiling()
+        compiling.announce()
 
     num_judged = judged_episodes(to_json(first), world)
     assert num_judged is not None
     judged = dataclasses.replace(world.judged, episodes=num_judged)
-    return sweep(
+    outcomes = sweep(
         env,
         policy,
         tasks,
@@ -87,6 +109,8 @@ def adapt_all(
         journal=journal,
         begin=begin,
     )
+    compiling.done()
+    return outcomes
 
 
 NOT_DECIDING = (

@@ -22,7 +22,7 @@ from envs.base import Demonstrator, Environment, Episode
 from envs.episodes import run_episode
 from envs.errors import DataError
 from experiments.demonstrators import find_demonstrator
-from experiments.runtime import expect_compiling, refuse_existing
+from experiments.runtime import Compiling, refuse_existing
 from experiments.store.provenance import provenance, versions
 from experiments.store.settings import CollectConfig, dataset_folder
 from experiments.store.work import PIECES, long_work
@@ -367,7 +367,11 @@ def collect_and_save(
         check_place(folder, num_bytes=config.trajectories * SMALLEST_TRAJECTORY)
     work_on = long_work(folder, asked, provenance(), config.resume, wait, go_on)
     with work_on as work, GrowingFiles(work.place) as files:
-        expect_compiling()
+        compiling = Compiling(
+            f"demonstrations of {name} in {config.env}",
+            {"command": "collect", **made, "seed": None, "size": config.trajectories},
+        )
+        compiling.announce()
         cpu = time.process_time()
         facts = collected(
             env,
@@ -378,6 +382,7 @@ def collect_and_save(
             files.append,
             work.journal,
         )
+        compiling.done()
         cpu = processes.total(time.process_time() - cpu)
         if facts is not None:
             files.finish()

@@ -15,6 +15,8 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import hashlib
+import json
 import os
 import platform
 import sys
@@ -23,9 +25,10 @@ import threading
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -108,15 +111,44 @@ def cache_folder() -> str:
     return str(home / ".cache" / "mgpo_jax")
 
 
-def expect_compiling() -> None:
-    """If the compilation cache is empty, say on stderr that the work begins with compiling."""
-    try:
-        empty = next(os.scandir(cache_folder()), None) is None
-    except OSError:
-        empty = True
-    if empty:
-        text = "the compilation cache is empty: compiling first, which can take up to two minutes"
-        print(text, file=sys.stderr)
+@dataclass(frozen=True)
+class Compiling:
+    """Work that begins with compiling, unless its programs are in the compilation cache already.
+
+    jax does not tell whether they are. Work that was done before therefore leaves an empty file in the
+    cache, whose name is a hash of what decides its programs.
+
+    Attributes:
+      what: the work in a few words, for the message.
+      deciding: what the programs depend on, as JSON values: names of world and method, sizes.
+    """
+
+    what: str
+    deciding: Mapping[str, Any]
+
+    def announce(self) -> None:
+        """Say on stderr that the work begins with compiling, if it was not done with this cache before."""
+        if not self._marker.exists():
+            text = (
+                f"{self.what}: compiling first, which can take some minutes; the next time, programs come "
+                "from the cache (if XLA warns of a very slow compile, that is no error)"
+            )
+            print(text, file=sys.stderr)
+
+    def done(self) -> None:
+        """Remember that the programs are in the cache; without a cache there is nothing to remember."""
+        with suppress(OSError):
+            self._marker.touch()
+
+    @property
+    def _marker(self) -> Path:
+        facts = {
+            **self.deciding,
+            "versions": [version("jax"), version("jaxlib")],
+            "devices": [os.environ.get(name, "") for name in ("JAX_PLATFORMS", "XLA_FLAGS")],
+        }
+        text = json.dumps(facts, sort_keys=True)
+        return Path(cache_folder(), f"compiled-{hashlib.sha256(text.encode()).hexdigest()[:16]}")
 
 
 def run(

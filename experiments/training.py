@@ -19,7 +19,7 @@ from envs.base import Environment
 from experiments.demonstrators import find_demonstrator
 from experiments.figures import training_curve
 from experiments.networks import configured_network, initial_policy
-from experiments.runtime import expect_compiling
+from experiments.runtime import Compiling
 from experiments.signals import Stopped, asked_to_stop, farewell
 from experiments.store import runs
 from experiments.store.metrics import METRICS, Metrics, check_loggers, salvaged_rows
@@ -90,10 +90,19 @@ class Run:
             meta = {**meta, "dataset": str(place), "dataset_sha256": sha256, **self.origin}
             if begun := runs.has_begun(self.folder):
                 runs.check_same(config, meta)
-            expect_compiling()
+            self._compiling.announce()
             self._returns_on_the_way = self._watched(env)
             self._note(meta, begun)
             self.identities = runs.identities(config, sha256, init_sha256)
+
+    @property
+    def _compiling(self) -> Compiling:
+        """What decides the programs of the run, for the announcement that they are compiled."""
+        config, plan = self.config, self.config.train
+        sizes = [plan.batch_size, plan.part_size, plan.part_steps, plan.bucket, config.eval_tasks]
+        facts = {"env": config.env, "network": to_json(self.network), "sizes": sizes}
+        kind = {"command": "pretrain", "method": config.method, "optimizer": plan.optimizer}
+        return Compiling(f"{config.method} in {config.env}", {**kind, **facts})
 
     def _note(self, meta: dict[str, Any], begun: bool) -> None:
         """Write down in the folder what the run is; called after all settings have been checked."""
@@ -151,6 +160,7 @@ class Run:
         for name, value in found.items():
             if not np.isfinite(value):
                 raise diverged(state.step, name, value)
+        self._compiling.done()
         return found
 
     def batches(self, first_step: int) -> Iterator[list[BatchPlan]]:

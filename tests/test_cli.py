@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ import pytest
 import envs
 from envs.errors import MissingExtraError
 from envs.registry import WORLDS
-from experiments import pretrain, runtime, training
+from experiments import adaptation, pretrain, runtime, training
 from experiments.__main__ import COMMANDS
 from experiments.parsing import parse
 from experiments.store.adapt_settings import AdaptConfig
@@ -35,7 +35,7 @@ from mgpo_jax import methods
 from mgpo_jax.dataset import load_dataset
 from mgpo_jax.files import hash_file
 from mgpo_jax.kinds import KINDS
-from mgpo_jax.policy_files import read_policy
+from mgpo_jax.policy_files import load_policy, read_policy
 from mgpo_jax.tasks import (
     benchmark_tasks,
     load_tasks,
@@ -43,6 +43,7 @@ from mgpo_jax.tasks import (
     sample_tasks,
     save_tasks,
     task_hashes,
+    test_tasks,
 )
 from mgpo_jax.training import Trainer
 
@@ -727,18 +728,64 @@ def test_a_continuous_world_from_data_to_release(
     assert not Path("other").exists()
 
 
-def test_the_first_command_says_that_it_compiles(
+def test_work_that_was_not_done_before_says_that_it_compiles(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setenv("MGPO_CACHE", str(tmp_path / "cache"))
-    runtime.expect_compiling()
-    assert "the compilation cache is empty" in capsys.readouterr().err
-    (tmp_path / "cache").mkdir()
-    runtime.expect_compiling()
-    assert "the compilation cache is empty" in capsys.readouterr().err
-    (tmp_path / "cache" / "program").touch()
-    runtime.expect_compiling()
+    """Other programs in the cache do not matter, nor does work that was interrupted while it compiled."""
+    cache = tmp_path / "cache"
+    monkeypatch.setenv("MGPO_CACHE", str(cache))
+    work = runtime.Compiling("ucb in tiny", {"env": "tiny", "sizes": [1, 2]})
+    work.done()  # without a folder nothing is remembered
+    for others in (False, True):
+        if others:
+            cache.mkdir()
+            (cache / "program").touch()
+        work.announce()
+        assert "ucb in tiny: compiling first" in capsys.readouterr().err
+    work.done()
+    runtime.Compiling("the same again", dict(work.deciding)).announce()
     assert capsys.readouterr().err == ""
+    for changes in ({"env": "other"}, {"sizes": [2, 1]}):
+        runtime.Compiling("bpe", {**work.deciding, **changes}).announce()
+        assert "bpe: compiling first" in capsys.readouterr().err
+    monkeypatch.setenv("XLA_FLAGS", "--another")
+    work.announce()
+    assert "compiling first" in capsys.readouterr().err
+
+
+def test_a_command_announces_once_what_it_compiles(
+    command: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "cache").mkdir()
+    monkeypatch.setenv("MGPO_CACHE", str(tmp_path / "cache"))
+    for number, announced in ((1, True), (2, False)):
+        code, text = command(f"collect --trajectories 8 --out own{number}")
+        assert code == 0, text
+        assert ("demonstrations of astar4 in maze15: compiling first" in text) == announced
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_an_adaptation_counts_as_compiled_once_it_has_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], fails: bool
+) -> None:
+    def searched(*args: Any, begin: Callable[[], object], **options: Any) -> list[Any]:
+        begin()
+        if fails:
+            raise KeyboardInterrupt
+        return []
+
+    (tmp_path / "cache").mkdir()
+    monkeypatch.setenv("MGPO_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(adaptation, "sweep", searched)
+    world, env = envs.find("maze15"), envs.make("maze15")
+    policy = load_policy(world)
+    told = []
+    for seeds in (1, 1, 2):
+        configs = [AdaptConfig(seeds=seeds)]
+        with pytest.raises(KeyboardInterrupt) if fails else nullcontext():
+            adaptation.adapt_all(world, env, policy, test_tasks(world), configs)
+        told.append("ucb in maze15: compiling first" in capsys.readouterr().err)
+    assert told == [True, fails, True]
 
 
 @pytest.mark.parametrize(
