@@ -13,7 +13,7 @@ pytest.importorskip("craftax")
 crafter = pytest.importorskip("crafter")
 from crafter import objects  # noqa: E402
 
-from envs.crafter import rules  # noqa: E402
+from envs.crafter import fidelity, rules  # noqa: E402
 from envs.crafter.env import Crafter, CrafterTask  # noqa: E402
 from envs.crafter.official import (  # noqa: E402
     BLOCK_OF,
@@ -364,6 +364,20 @@ def test_arrows_hurt(facing, asleep):
     assert play(both, "noop 4") == []
     assert int(both.mine.world.player_health) == 7
     assert not bool(both.mine.world.is_sleeping)
+
+
+def test_fidelity_counts_all_kinds_of_mobs(monkeypatch):
+    """In the order of their codes, which is that of the rows that it prints."""
+    assert fidelity.MOBS_TOLD == ("zombies", "cows", "skeletons")
+    beside = [objects.Skeleton, objects.Skeleton, objects.Zombie]
+
+    def peopled(world, player):
+        for column, kind in enumerate(beside, start=1):
+            world.add(kind(world, (player.pos[0], player.pos[1] + column), player))
+
+    monkeypatch.setattr(crafter.env.worldgen, "generate_world", peopled)
+    seen = fidelity.seen_in_crafter(1, 1)
+    np.testing.assert_array_equal(seen, [[1, 0, 2]])
 
 
 @pytest.mark.parametrize("target", list(LETTERS))

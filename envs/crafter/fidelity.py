@@ -24,12 +24,22 @@ from envs.base import Agent
 from envs.crafter.env import Crafter, CrafterState, CrafterTask
 from envs.crafter.official import import_crafter
 from envs.crafter.rules import new_world
-from envs.crafter.view import BLOCKS, COLUMNS, MAX_COUNT, NUM_ACTIONS, NUM_CELLS, ROWS
+from envs.crafter.view import (
+    BLOCKS,
+    COLUMNS,
+    MAX_COUNT,
+    MOBS,
+    NUM_ACTIONS,
+    NUM_CELLS,
+    NUM_MOBS,
+    ROWS,
+)
 from envs.episodes import run_episode
 from envs.errors import UsageError
 
 BLOCKS_TOLD = ("grass", "water", "stone", "path", "sand", "tree", "coal", "iron", "diamond", "lava")
-MOBS_TOLD = ("zombies", "cows")
+MOBS_TOLD = tuple(f"{name}s" for name in MOBS[1:])
+"""The mobs that are counted, in the order of their codes."""
 MOVES = range(1, 5)  # left, right, up, down: the same numbers in both programs
 FIRST, DARKEST = slice(0, 100), slice(185, 235)  # ranges of steps; the light is lowest at step 210
 
@@ -71,7 +81,7 @@ def shares_in_crafter(num_worlds: int) -> dict[str, float]:
 
 
 def seen_here(num_walks: int, num_steps: int) -> Float[np.ndarray, "T mobs"]:
-    """The number of zombies and cows in view of an immortal agent after each step, averaged over walks."""
+    """The number of mobs of each kind in view of an immortal agent after each step, averaged over walks."""
     env = Crafter(name="crafter-symbolic", horizon=num_steps + 1)
 
     def walk(key: PRNGKeyArray, seed: Array) -> Array:
@@ -81,12 +91,14 @@ def seen_here(num_walks: int, num_steps: int) -> Float[np.ndarray, "T mobs"]:
         def step(state: CrafterState, key: PRNGKeyArray) -> tuple[CrafterState, Array]:
             action = jax.random.randint(key, (), MOVES.start, MOVES.stop)
             state, timestep = env.step(state, action)
-            mobs = timestep.obs[:NUM_CELLS].astype(int) // len(BLOCKS) % 4
+            mobs = timestep.obs[:NUM_CELLS].astype(int) // len(BLOCKS) % NUM_MOBS
             healthy = state.world.replace(
                 player_health=jnp.full_like(state.world.player_health, MAX_COUNT)
             )
             state = state._replace(world=healthy, health=healthy.player_health)
-            return state, jnp.stack([(mobs == 1).sum(), (mobs == 2).sum()])
+            return state, jnp.stack(
+                [(mobs == code).sum() for code, _ in enumerate(MOBS_TOLD, start=1)]
+            )
 
         return jax.lax.scan(step, state, jax.random.split(key_walk, num_steps))[1]
 
@@ -108,7 +120,7 @@ def seen_in_crafter(num_walks: int, num_steps: int) -> Float[np.ndarray, "T mobs
         for time_ in range(num_steps):
             env.step(int(rng.integers(MOVES.start, MOVES.stop)))
             env._player.health = MAX_COUNT
-            for index, kind in enumerate((objects.Zombie, objects.Cow)):
+            for index, kind in enumerate((objects.Zombie, objects.Cow, objects.Skeleton)):
                 found[seed, time_, index] = sum(
                     isinstance(thing, kind) and in_view(thing.pos, env._player.pos)
                     for thing in env._world.objects
