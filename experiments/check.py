@@ -63,11 +63,11 @@ def named_worlds(config: CheckConfig) -> list[str]:
     Raises:
       UsageError: for an unknown world, or a mixture of worlds and result folders.
     """
-    for path in config.runs:
-        # A path with folders in it is no mistyped world.
-        if not (os.path.lexists(path) or is_world(str(path)) or len(path.parts) > 1):
-            raise nearest(str(path), envs.names(), "folder or world")
-    names = [str(path) for path in config.runs if not os.path.lexists(path) and is_world(str(path))]
+    missing = [str(path) for path in config.runs if not os.path.lexists(path)]
+    words = [name for name in missing if "/" not in name]  # the others can only be folders
+    names = [name for name in words if name in envs.names() or ":" in name]
+    if lost := [name for name in words if name not in names]:
+        raise nearest(lost[0], envs.names(), "folder or world")
     if names and len(names) < len(config.runs):
         raise UsageError("give worlds to check, or result folders to compare, not both at once")
     if names and (config.env or config.policy):
@@ -77,11 +77,6 @@ def named_worlds(config: CheckConfig) -> list[str]:
     for name in names:
         envs.find(name)
     return names
-
-
-def is_world(text: str) -> bool:
-    """Whether an argument that is not a folder names a world."""
-    return text in envs.names() or (":" in text and "/" not in text)
 
 
 def check(names: Sequence[str], out: Path | None, as_json: bool = False) -> None:
