@@ -11,15 +11,11 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NoReturn, Union, get_type_hints
 
 import tyro
-from tyro.constructors import (
-    ConstructorRegistry,
-    StructConstructorSpec,
-    StructFieldSpec,
-    StructTypeInfo,
-)
+from tyro.constructors import ConstructorRegistry, StructFieldSpec
 
 import envs
 from envs.errors import UsageError, nearest
+from experiments.parsing import add_struct_rule
 from experiments.runtime import Common, run, say
 from mgpo_jax import methods
 from mgpo_jax.settings import Name
@@ -80,19 +76,11 @@ def _union_of(settings: Mapping[str, Any]) -> Any:
 
 def _with_known_names() -> ConstructorRegistry:
     """Rules for tyro that make the names of worlds and methods choices, which scripts complete."""
-    registry, under_way = ConstructorRegistry(), set[type]()
-
-    @registry.struct_rule
-    def settings(info: StructTypeInfo) -> StructConstructorSpec | None:
-        if info.type in under_way or not dataclasses.is_dataclass(info.type):
-            return None
-        under_way.add(info.type)
-        spec = ConstructorRegistry.get_struct_spec(info)  # tyro's own rule for dataclasses
-        under_way.discard(info.type)
-        if not isinstance(spec, StructConstructorSpec):
-            return None
-        return dataclasses.replace(spec, fields=tuple(map(_with_choices, spec.fields)))
-
+    registry = ConstructorRegistry()
+    add_struct_rule(
+        registry,
+        lambda kind, spec: dataclasses.replace(spec, fields=tuple(map(_with_choices, spec.fields))),
+    )
     return registry
 
 

@@ -10,12 +10,12 @@ import itertools
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from envs.errors import DataError, UsageError, shown
 from experiments.joining import OF_PROCESSES
 from mgpo_jax.schema import Json, read_document
-from mgpo_jax.settings import flag, flag_off, is_settings, types_of
+from mgpo_jax.settings import aliases_of, flag, flag_off, is_settings
 
 OWN = frozenset({"config", "debug", "dry_run", "json", "out", "quiet", "resume", *OF_PROCESSES})
 """Settings that belong to a single call of a command and are not taken from a file."""
@@ -102,9 +102,8 @@ def _names(config_class: type) -> dict[str, str]:
     for field in dataclasses.fields(config):
         if is_settings(getattr(config, field.name)):
             found |= _names(type(getattr(config, field.name)))
-        for extra in get_args(types_of(config_class).get(field.name))[1:]:
-            for alias in getattr(extra, "aliases", None) or ():
-                found[_name_of(alias)] = field.name
+        for alias in aliases_of(config_class, field.name):
+            found[_name_of(alias)] = field.name
     return found
 
 

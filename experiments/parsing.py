@@ -33,7 +33,15 @@ from tyro.constructors import (
 
 from envs.errors import UsageError, shown
 from experiments.config_files import expanded
-from mgpo_jax.settings import check_values, flag, flag_off, is_settings, range_of, types_of
+from mgpo_jax.settings import (
+    aliases_of,
+    check_values,
+    flag,
+    flag_off,
+    is_settings,
+    range_of,
+    types_of,
+)
 
 Defaults = Callable[[Any, Sequence[str]], Any]
 """``(config, flags) -> default config``. The config has the values that were typed and general defaults
@@ -141,17 +149,10 @@ def _flags(config: Any) -> dict[str, str]:
             more = _flags(value)
         else:
             kind = types_of(config.__class__).get(field.name, field.type)
-            extras = get_args(kind)[1:]
-            if tyro.conf.Positional in extras:
+            if tyro.conf.Positional in get_args(kind)[1:]:
                 continue
             own = flag(field.name)
-            more = dict.fromkeys(
-                [
-                    own,
-                    *(alias for extra in extras for alias in getattr(extra, "aliases", None) or ()),
-                ],
-                own,
-            )
+            more = dict.fromkeys([own, *aliases_of(config.__class__, field.name)], own)
             if isinstance(value, bool):
                 more[flag_off(field.name)] = own
         if twice := found.keys() & more.keys():
@@ -188,12 +189,17 @@ def _refuse_unknown(unknown: Sequence[str], known: Sequence[str], prog: str) -> 
     raise UsageError(f"unexpected argument {shown(unknown[0])}; {_way_out(prog)}")
 
 
-def _registry() -> ConstructorRegistry:
-    """Our rules for tyro: how values are read and checked, and how the help shows their ranges."""
-    registry = ConstructorRegistry()
-    registry.primitive_rule(_number)
-    registry.primitive_rule(_choice)
-    under_way: set[type] = set()
+def add_struct_rule(
+    registry: ConstructorRegistry,
+    change: Callable[[type, StructConstructorSpec], StructConstructorSpec],
+) -> None:
+    """Add a rule to tyro's: what it makes of a dataclass of settings goes through ``change``.
+
+    Args:
+      registry: the rules.
+      change: ``(dataclass, tyro's specification) -> specification``.
+    """
+    under_way: set[type] = set()  # classes that tyro's own rule is just being asked about
 
     @registry.struct_rule
     def settings(info: StructTypeInfo) -> StructConstructorSpec | None:
@@ -204,13 +210,23 @@ def _registry() -> ConstructorRegistry:
             spec = ConstructorRegistry.get_struct_spec(info)  # tyro's own rule for dataclasses
         finally:
             under_way.discard(info.type)
-        if not isinstance(spec, StructConstructorSpec):
-            return None
-        return StructConstructorSpec(
-            instantiate=partial(_checked, info.type, spec.instantiate),
-            fields=tuple(map(_with_range, spec.fields)),
-        )
+        return change(info.type, spec) if isinstance(spec, StructConstructorSpec) else None
 
+
+def _with_checks(kind: type, spec: StructConstructorSpec) -> StructConstructorSpec:
+    """Settings that are checked when they are made, and whose help shows ranges."""
+    return StructConstructorSpec(
+        instantiate=partial(_checked, kind, spec.instantiate),
+        fields=tuple(map(_with_range, spec.fields)),
+    )
+
+
+def _registry() -> ConstructorRegistry:
+    """Our rules for tyro: how values are read and checked, and how the help shows their ranges."""
+    registry = ConstructorRegistry()
+    registry.primitive_rule(_number)
+    registry.primitive_rule(_choice)
+    add_struct_rule(registry, _with_checks)
     return registry
 
 

@@ -88,6 +88,12 @@ def types_of(settings_class: type) -> dict[str, Any]:
         return {}
 
 
+def aliases_of(settings_class: type, name: str) -> list[str]:
+    """The other flags of a setting, such as older ones."""
+    extras = get_args(types_of(settings_class).get(name))[1:]
+    return [alias for extra in extras for alias in getattr(extra, "aliases", None) or ()]
+
+
 def check_settings(settings: Any) -> None:
     """Raise ``UsageError`` for the first field of a dataclass whose value its type does not allow."""
     values = {field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)}
