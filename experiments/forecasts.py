@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 import envs
-from envs.base import Discrete, Environment, EnvSpec, Task
+from envs.base import Environment, EnvSpec, Task
 from envs.registry import World
 from experiments.inventory import price_of, seconds_per_episode
 from experiments.networks import sized_network
@@ -142,17 +142,12 @@ def _facts_of_network(config: PretrainConfig, spec: EnvSpec) -> list[Fact]:
 def _facts_of_input(spec: EnvSpec) -> list[Fact]:
     """The shapes of what the network reads and of what it puts out."""
     shape, dtype = list(spec.obs.shape), str(spec.obs.dtype)
-    discrete = isinstance(spec.actions, Discrete)
-    actions = f"{_num_outputs(spec)} discrete" if discrete else f"{_num_outputs(spec)} numbers"
+    actions = f"{spec.action_dim} {'discrete' if spec.discrete else 'numbers'}"
     return [
         Fact("observations", f"{dtype}{shape}", {"dtype": dtype, "shape": shape}),
         Fact("goals", f"{spec.goal_dim} numbers", spec.goal_dim),
-        Fact("actions", actions, {"discrete": discrete, "num": _num_outputs(spec)}),
+        Fact("actions", actions, {"discrete": spec.discrete, "num": spec.action_dim}),
     ]
-
-
-def _num_outputs(spec: EnvSpec) -> int:
-    return spec.actions.num if isinstance(spec.actions, Discrete) else spec.actions.size
 
 
 def _bytes_of_trajectory(spec: EnvSpec) -> int:
@@ -161,8 +156,8 @@ def _bytes_of_trajectory(spec: EnvSpec) -> int:
     These are observations, executed and intended actions, achieved goals and outcomes, and whether a goal
     was reached.
     """
-    obs = math.prod(spec.obs.shape) * np.dtype(spec.obs.dtype).itemsize
-    action = 1 if isinstance(spec.actions, Discrete) else spec.actions.size
+    obs = spec.obs.size * np.dtype(spec.obs.dtype).itemsize
+    action = 1 if spec.discrete else spec.action_dim
     return int(spec.horizon * (obs + 2 * 4 * action + 2 * 4 * spec.goal_dim + 1))
 
 
