@@ -337,7 +337,7 @@ class Environment:
     def fingerprint(self, task: Task) -> Int[Array, "F"]:
         """The part of a task in which training and test tasks must differ (default: all bytes of the
         task)."""
-        leaves = [_without_key(jnp.asarray(leaf)) for leaf in jax.tree.leaves(task)]
+        leaves = [raw(jnp.asarray(leaf)) for leaf in jax.tree.leaves(task)]
         leaves = [leaf.astype(jnp.uint8) if leaf.dtype == bool else leaf for leaf in leaves]
         as_bytes = [jax.lax.bitcast_convert_type(leaf, jnp.uint8).ravel() for leaf in leaves]
         return jnp.concatenate(as_bytes).astype(jnp.int32)
@@ -363,10 +363,14 @@ class Environment:
             )
 
 
-def _without_key(leaf: Array) -> Array:
-    """The raw data of random keys; any other array unchanged."""
-    is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-    return jax.random.key_data(leaf) if is_key else leaf
+def is_key(leaf: Any) -> bool:
+    """Whether an array holds random keys."""
+    return isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def raw(leaf: Any) -> Any:
+    """The raw data of random keys; anything else unchanged."""
+    return jax.random.key_data(leaf) if is_key(leaf) else leaf
 
 
 def check_shapes(tasks: Task, example: Task) -> None:

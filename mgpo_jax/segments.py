@@ -19,6 +19,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool
 
+from envs.base import is_key
 from envs.errors import DataError
 from mgpo_jax import processes
 from mgpo_jax.adaptation import CHECK_RETURNS, AdaptLog, Judged
@@ -27,7 +28,7 @@ from mgpo_jax.lanes import Grid, Lanes, Layout
 from mgpo_jax.outcomes import Part, Record, without_goals
 from mgpo_jax.programs import Programs
 from mgpo_jax.progress import Progress
-from mgpo_jax.sharding import fetch, is_key, on_devices, split
+from mgpo_jax.sharding import fetch, on_devices, split
 from mgpo_jax.stopping import ended, filled
 from mgpo_jax.trees import numbered_leaves, with_leaves
 

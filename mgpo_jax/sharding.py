@@ -23,6 +23,7 @@ from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
+from envs.base import is_key, raw
 from envs.errors import UsageError
 from mgpo_jax import processes
 
@@ -124,10 +125,6 @@ def fetch(tree: Any) -> Any:
     Arrays that are spread over several processes are gathered in all of them, so every process must call
     this.
     """
-
-    def raw(leaf: Any) -> Any:
-        return jax.random.key_data(leaf) if is_key(leaf) else leaf
-
     tree = jax.tree.map(raw, tree)
     if all(getattr(leaf, "is_fully_addressable", True) for leaf in jax.tree.leaves(tree)):
         return jax.device_get(tree)
@@ -185,11 +182,6 @@ def _heads() -> Mesh:
 @cache
 def _gathering(heads: Mesh) -> Any:
     return jax.jit(lambda rows: rows, out_shardings=NamedSharding(heads, PartitionSpec()))
-
-
-def is_key(leaf: Any) -> bool:
-    """Whether an array holds random keys."""
-    return isinstance(leaf, jax.Array) and jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def gather_rows(mesh: Mesh, tree: Any) -> list[Any]:

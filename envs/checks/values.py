@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from envs.base import raw
+
 
 def reason(error: BaseException) -> str:
     """The first line of an error."""
@@ -16,20 +18,14 @@ def reason(error: BaseException) -> str:
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
-def _raw(leaf: Any) -> Any:
-    """The raw data of random keys; any other array unchanged."""
-    is_key = jnp.issubdtype(jnp.result_type(leaf), jax.dtypes.prng_key)
-    return jax.random.key_data(leaf) if is_key else leaf
-
-
 def all_equal(a: Any, b: Any) -> Array:
     pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
-    same = [jnp.all(jnp.equal(_raw(x), _raw(y))) for x, y in pairs]
+    same = [jnp.all(jnp.equal(raw(x), raw(y))) for x, y in pairs]
     return jnp.all(jnp.stack(same)) if same else jnp.ones((), bool)
 
 
 def as_numpy(tree: Any) -> Any:
-    return jax.tree.map(lambda leaf: np.asarray(_raw(leaf)), tree)
+    return jax.tree.map(lambda leaf: np.asarray(raw(leaf)), tree)
 
 
 def equal(a: Any, b: Any) -> bool:
