@@ -72,8 +72,8 @@ class GymnasiumWorld:
       optimum: the best return on every task [unknown].
       most: number of environments that are kept alive. Collection runs 250 episodes at once; with fewer
         environments, episodes are replayed from their resets, which is slow.
-      threads: number of threads that step the environments [1, since Python code runs on one thread at a
-        time].
+      threads: number of threads that step the environments, or None for one on each core [1, since Python
+        code runs on one thread at a time].
       together: smallest number of episodes that a program steps in one call.
       truncate_in_hindsight, reward_confirms_goals, goals_are_states: see ``envs.EnvSpec``.
     """
@@ -110,6 +110,7 @@ class GymnasiumWorld:
         for what, value in (
             ("repeat", self.repeat),
             ("most", self.most),
+            ("threads", 1 if self.threads is None else self.threads),
             ("together", self.together),
         ):
             if value < 1:

@@ -337,6 +337,7 @@ def test_observations_are_joined_and_goals_are_drawn() -> None:
         ({"horizon": None}, "no max_episode_steps; say after how many actions"),
         ({"deterministic": False}, "pass options, or leave out deterministic=False"),
         ({"repeat": 0}, "repeat of plane must be at least 1"),
+        ({"threads": 0}, "threads of plane must be at least 1"),
         ({"make": own_gymnasium.Switches}, "have no achieved_goal; say how to read it"),
         (
             {"make": lambda: gymnasium.wrappers.TransformAction(
