@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from envs.installing import DISTRIBUTION, how_to_install
 from envs.registry import World
+from experiments.store.runs import WEIGHTS
 from mgpo_jax.kinds import KINDS
 from mgpo_jax.released import released_folder
 
@@ -76,7 +77,7 @@ class Network(NamedTuple):
 
 def released_networks(world: World) -> list[Network]:
     """The released networks of a world, by kind, with the sizes of their weights."""
-    weights = {kind: released_folder(world, kind) / "weights.npz" for kind in KINDS.names()}
+    weights = {kind: released_folder(world, kind) / WEIGHTS for kind in KINDS.names()}
     return [Network(kind, path.stat().st_size) for kind, path in weights.items() if path.is_file()]
 
 

@@ -16,8 +16,10 @@ from envs.registry import WORLDS, World
 from experiments.demonstrators import find_demonstrator
 from experiments.figures import training_curve
 from experiments.store.initial import INIT
+from experiments.store.layout import TASKS
 from experiments.store.metrics import METRICS, RESUME, cpu_seconds_of_training, read_metrics
 from experiments.store.provenance import read_meta
+from experiments.store.runs import META, PICTURE, POLICY
 from experiments.store.settings import NO_WORLD, PretrainConfig, pretraining_from
 from mgpo_jax.dataset import variant_counts
 from mgpo_jax.files import new_folder, write_text
@@ -90,7 +92,7 @@ def read_run(source: Path, env: str | None = None) -> Finished:
       DataError: if a file is missing or damaged, or the policy does not fit the world that it names.
       UsageError: if the run has no policy, or is from another world than ``env``.
     """
-    policy, path = read_policy(source / "policy"), source / "policy" / CONFIG
+    policy, path = read_policy(source / POLICY), source / POLICY / CONFIG
     given = envs.find(env) if env is not None else None  # imports it, so that files may name it
     name, settings = policy.made.get("env"), policy.made.get("config")
     if name is None or not isinstance(settings, dict):
@@ -112,7 +114,7 @@ def read_run(source: Path, env: str | None = None) -> Finished:
             f"{path}: made.env is {shown(name)}, made.config.env is {shown(config.env)}; {RESUME}"
         )
     rows = read_metrics(source / METRICS, METRICS_SHOWN)
-    meta = read_meta(source / "meta.json", RESUME)
+    meta = read_meta(source / META, RESUME)
     variants = variant_counts(Path(meta.dataset), meta.dataset_sha256) if meta.dataset else {}
     command = " ".join(_without_out(meta.command)) or "(not known)"
     return Finished(source, world, policy, config, rows, command, variants)
@@ -222,11 +224,11 @@ def release(run: Finished, folder: Path) -> None:
     """Write the released files of a run to a new folder, which appears only when it is complete."""
     with new_folder(folder) as place:
         for name in (WEIGHTS, CONFIG, GOALS):
-            if (run.source / "policy" / name).is_file():  # older runs have no goals
-                shutil.copy(run.source / "policy" / name, place / name)
+            if (run.source / POLICY / name).is_file():  # older runs have no goals
+                shutil.copy(run.source / POLICY / name, place / name)
         shutil.copy(run.source / METRICS, place)
-        training_curve(run.rows, run.kind.watched).savefig(place / "training.png")
+        training_curve(run.rows, run.kind.watched).savefig(place / PICTURE)
         if run.kind.name == MULTI_GOAL:
             tasks = benchmark_tasks(run.world.make(), run.world.num_test_tasks)
-            save_tasks(place / "tasks.npz", tasks)
+            save_tasks(place / TASKS, tasks)
         write_text(place / "README.md", card(run))
