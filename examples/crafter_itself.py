@@ -24,6 +24,7 @@ import mgpo_jax as mgpo
 from envs.crafter.official import CrafterEpisode
 from envs.errors import UsageError
 from envs.official import Played, play
+from experiments.runtime import configure
 from experiments.store.statistics import mean_log_success
 from experiments.store.tables import table
 
@@ -72,6 +73,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    configure()
     try:
         main()
     except (ImportError, UsageError) as error:

@@ -146,6 +146,27 @@ def test_what_the_policy_reached_in_crafter_itself_is_told() -> None:
     assert told["achieved"] == "50.0 %"
 
 
+def test_ways_of_acting_are_compared() -> None:
+    from examples.task_goal import rows
+
+    returns = np.zeros((2, 3, 4))
+    returns[0, 1] = 6.0  # one episode of each task
+    greedy, sampled = rows([0.0, 1.0], returns)
+    assert greedy[:3] == ["greedy", "12", "2.00 ± 0.85"]
+    assert greedy[3:] == ["2.000 [2.000, 2.000]", "6.00"]
+    assert sampled == ["sampled at 1", "12", "0.00 ± 0.00", "", "0.00"]
+
+
+@pytest.mark.slow
+def test_the_task_goal_alone_is_played() -> None:
+    """On the validation tasks, and no two episodes at random."""
+    from examples.task_goal import play
+
+    returns = play("gridworld", [0.0, 1.0], episodes=2, validation=True)
+    assert returns.shape == (2, 2, 50)
+    assert (returns[1, 0] != returns[1, 1]).any()
+
+
 def test_the_large_data_are_a_dataset_and_the_guide_has_their_training(tmp_path: Path) -> None:
     big_data = importlib.import_module("examples.big_data")
     big_data.write(tmp_path / "data", 3)

@@ -129,7 +129,8 @@ CRAFTER_SYMBOLIC = World(
     presets={name: {**preset, "encoder": "cells"} for name, preset in PRESETS.items()},
     pictures=load_pictures,
     page=load_page,
-    # Greedy policies repeat themselves and get stuck. Returns vary with what the mobs do.
+    # Searches act with sampled actions, so policies are judged by them, too; greedy actions return about
+    # the same (docs/environments.md). Returns vary with what the mobs do, hence several episodes.
     judged=Judgement(mode="sample", temperature=1.0, episodes=16),
     # Approximately the standard deviation of the returns of one prompt. With the default unit, the range of
     # all returns (22.9), exploration would be seven times as strong.
