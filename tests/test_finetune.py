@@ -535,6 +535,31 @@ def test_a_round_ends_when_the_policy_has_moved_too_far(
     assert_close(after(epochs=4, max_kl=1e9), after(epochs=4), 1e-6)
 
 
+@pytest.mark.optimized
+def test_epochs_after_the_end_of_a_round_are_left_out_and_no_bit_changes(
+    params: Any, round_of_episodes: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Against the loop that computes them all and throws away what follows the end."""
+    _, state, query, episodes = round_of_episodes
+    hyper = PpoHyper(learning_rate=0.01, kl=0.1, epochs=6)
+
+    def after(stops: bool) -> list[Any]:
+        changed = replace(hyper, max_kl=1e-3 if stops else 1e9)
+        tell = jax.jit(make_ppo(SETTING, params, changed).tell)
+        states = [state]
+        for _ in range(3):
+            states.append(tell(jax.random.key(4), states[-1], query, episodes))
+        return [one.weights for one in states[1:]]
+
+    short, whole = after(True), after(False)
+    with pytest.raises(AssertionError):
+        assert_equal(short, whole)  # rounds do end early
+    monkeypatch.setattr(
+        finetune, "repeated", lambda num, epoch, start, _: jax.lax.fori_loop(0, num, epoch, start)
+    )
+    assert_equal(short, after(True))
+
+
 def test_values_alone_are_learned_at_first(params: Any, round_of_episodes: Any) -> None:
     """They approach the discounted returns, while the policy stays as it was."""
     _, _, query, episodes = round_of_episodes

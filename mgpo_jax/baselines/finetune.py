@@ -139,6 +139,26 @@ def with_policy(state: Any, source: Any) -> Any:
     return state._replace(inner_states=parts)
 
 
+def repeated(num: int, epoch: Callable[[Array, Any], Any], start: Any, stops: bool) -> Any:
+    """Run the epochs of a round.
+
+    Args:
+      num: the number of epochs.
+      epoch: ``(index, carry) -> carry``. The last entry of the carry says whether to go on; an epoch that
+        sets it to False leaves the others as they are.
+      start: the first carry.
+      stops: whether an epoch may set it to False; the remaining ones are then not computed.
+    """
+    if not stops:
+        return jax.lax.fori_loop(0, num, epoch, start)
+    _, carry = jax.lax.while_loop(
+        lambda loop: (loop[0] < num) & loop[1][-1],
+        lambda loop: (loop[0] + 1, epoch(*loop)),
+        (jnp.zeros((), jnp.int32), start),
+    )
+    return carry
+
+
 class Finetuner:
     """Fine-tuning by policy gradients on one task; all methods are pure.
 
@@ -215,7 +235,7 @@ class Finetuner:
             return new, new_state, going
 
         start = (state.weights, state.opt_state, jnp.ones((), bool))
-        weights, opt_state, _ = jax.lax.fori_loop(0, self.how.epochs, epoch, start)
+        weights, opt_state, _ = repeated(self.how.epochs, epoch, start, self.how.max_kl is not None)
         return state._replace(weights=weights, opt_state=opt_state, rounds=state.rounds + 1)
 
     def _batch(self, state: Learner, query: Query, episodes: Episode) -> Batch:
