@@ -47,7 +47,7 @@ def draw_run(world: World, results: Results, folder: Path) -> None:
 
     A file that was changed, or was not written by a command, is kept, with a line on stderr.
     """
-    curve = later(learning_curve, {results.method: results}, results.env)
+    curve = later(learning_curve, {results.method: results}, _title_of(world))
     drawn = [("learning_curve.png", curve)]
     if world.pictures is not None:
         pictures = world.pictures(envs.make(results.env))
@@ -55,6 +55,11 @@ def draw_run(world: World, results: Results, folder: Path) -> None:
     for name, save in drawn:
         if not is_kept(folder / name):
             write(folder / name, save)
+
+
+def _title_of(world: World) -> str:
+    """The name of a world and what it is."""
+    return f"{world.name}: {world.summary}" if world.summary else world.name
 
 
 def is_kept(path: Path) -> bool:
@@ -83,8 +88,8 @@ def pictures_together(
       policy: folder of the policy of all adaptations (default: the one that the results name).
     """
     first = next(iter(results.values()))
-    drawn = [("learning_curve.png", later(learning_curve, results, first.env))]
     world = envs.find(first.env)
+    drawn = [("learning_curve.png", later(learning_curve, results, _title_of(world)))]
     if world.pictures is not None:
         pictures = world.pictures(envs.make(first.env))
         for result in results.values():

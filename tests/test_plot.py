@@ -237,6 +237,17 @@ def test_what_learns_nothing_is_a_line_over_the_whole_width():
     assert len(lines) == 3  # the optimum, too
 
 
+def test_a_line_of_one_seed_is_marked_and_none_hides_its_equal():
+    one = replace(fake_results("bbt"), eval_returns=fake_results().eval_returns[:1])
+    ax = figures.learning_curve({"ucb": fake_results(), "bbt": one}).axes[0]
+    ucb, bbt, _ = ax.lines
+    assert (ucb.get_label(), bbt.get_label()) == ("MGPO-UCB", "BBT, one seed")
+    assert ucb.get_linewidth() > bbt.get_linewidth()
+    assert bbt.get_markerfacecolor() == "white"
+    alone = figures.learning_curve({"bbt": one}).axes[0]
+    assert alone.lines[0].get_label() == "BBT"
+
+
 def test_no_line_of_an_unknown_optimum():
     unknown = replace(fake_results(), optimal_returns=np.full(2, np.nan))
     (ax,) = figures.learning_curve({"ucb": unknown}).axes
@@ -278,9 +289,12 @@ def test_names_from_files_are_shown_as_they_are(name, tmp_path):
     result = fake_results(text.replace(" ", ""))
     figure = figures.learning_curve({text: result}, text)
     figure.savefig(tmp_path / "curve.png")
-    for label in (figure.axes[0].title, *figure.legends[0].get_texts()[:1]):
-        drawn, is_math = label._preprocess_math(label.get_text())
-        assert (drawn, is_math) == (shown, False)
+    label = figure.legends[0].get_texts()[0]
+    assert label._preprocess_math(label.get_text()) == (shown, False)
+    title, is_math = label._preprocess_math(figure.get_suptitle())
+    assert not is_math
+    lines = title.split("\n")  # a long title has two, each shorter than the figure is wide
+    assert title == shown or (name == "long" and len(lines) == 2 and max(map(len, lines)) < 80)
     width, height = iio.imread(tmp_path / "curve.png").shape[:2]
     assert max(width, height) < 2000
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from envs.drawing import INK
-from experiments.figures.style import METHODS, method_styles, plain, styled
+from experiments.figures.style import METHODS, STYLE, method_styles, plain, styled
 from experiments.store.statistics import performance_profile
 
 if TYPE_CHECKING:
@@ -18,18 +19,27 @@ if TYPE_CHECKING:
 IN_A_ROW = 3  # panels beside each other, so that their text is legible on a page
 RETURN = "evaluation return"
 """Label of the return in evaluation episodes, of an optimized prompt or of a learned policy."""
+TITLE_WIDTH = 70  # letters in a line of a title above a figure
+WIDEST, NARROWEST = 2.8, 1.0  # width of the first and the last line of a panel, in points
 
 
 @styled
 def learning_curve(results: Mapping[str, Results], title: str | None = None) -> Figure:
     """Figures 6 and 7: return of the optimized prompt, or of the learned policy, over the episodes.
 
-    Lines are means over tasks and seeds, bands the standard deviation over seeds. The optimum is drawn if
-    it is known. An adaptation of a single episode is a line at its return.
+    Lines are means over tasks and seeds, bands the standard deviation over seeds. Lines of a single seed
+    have hollow markers, and the legend says so. The optimum is drawn if it is known. An adaptation of a
+    single episode is a line at its return.
     """
     figure = Figure(figsize=(4.8, 2.7), layout="constrained")
-    _draw_curves(figure.add_subplot(), results, title)
-    figure.legend(loc="outside right upper")
+    ax = figure.add_subplot()
+    _draw_curves(ax, results, None)
+    if title:
+        figure.suptitle(_lines(title), fontsize=STYLE["axes.titlesize"])
+    for line, result in zip(ax.lines, results.values(), strict=False):  # those of optima come last
+        if len(result.eval_returns) == 1 < max(len(r.eval_returns) for r in results.values()):
+            line.set_label(f"{line.get_label()}, one seed")
+    figure.legend(loc="outside right center")
     return figure
 
 
@@ -57,19 +67,21 @@ def learning_curves(results: Mapping[str, Mapping[str, Results]]) -> Figure:
 
 
 def _draw_curves(ax: Any, results: Mapping[str, Results], title: str | None) -> None:
-    for label, (name, color, line, marker) in method_styles(results).items():
+    """Draw the curves of a panel; later ones are narrower, so that none hides another that it equals."""
+    widths = np.linspace(WIDEST, NARROWEST, len(results)) if len(results) > 1 else [2.0]
+    for (label, look), width in zip(method_styles(results).items(), widths, strict=True):
+        name, color, line, marker = look
         result = results[label]
         by_seed = result.eval_returns.mean(axis=1)
         mean, std = by_seed.mean(axis=0), by_seed.std(axis=0)
         episodes = result.eval_episodes
-        if (
-            episodes[-1] == 1
-        ):  # enough for a method that learns nothing: a line over the whole width
+        if episodes[-1] == 1:  # enough for a method that learns nothing
             ax.axhline(mean[-1], label=name, color=color, linestyle=line)
             continue
         ax.plot(
-            episodes, mean, label=name, color=color, linestyle=line, marker=marker,
-            markeredgecolor="white", markeredgewidth=0.6,
+            episodes, mean, label=name, color=color, linestyle=line, marker=marker, linewidth=width,
+            markeredgecolor=color if len(by_seed) == 1 else "white", markeredgewidth=0.6,
+            markerfacecolor="white" if len(by_seed) == 1 else color,
         )  # fmt: skip
         if len(by_seed) > 1:
             ax.fill_between(episodes, mean - std, mean + std, color=color, alpha=0.16, linewidth=0)
@@ -82,6 +94,11 @@ def _draw_curves(ax: Any, results: Mapping[str, Results], title: str | None) -> 
     ax.set(xlabel="episodes", ylabel=RETURN, title=plain(title or ""))
     ax.set_xlim(left=0)
     ax.margins(y=0.08)
+
+
+def _lines(title: str) -> str:
+    """A title in lines that fit above a figure."""
+    return "\n".join(textwrap.wrap(plain(title, 2 * TITLE_WIDTH), TITLE_WIDTH))
 
 
 @styled
