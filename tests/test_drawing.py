@@ -134,6 +134,8 @@ def test_command_draws_everything(tmp_path: Path, save: Save, policy: Path) -> N
         "tiny_learning_curve.png",
         "tiny_prompts.png",
         "tiny_short_and_long.png",
+        "tiny_methods.png",
+        *(f"tiny_{method}_episodes.png" for method in ("ucb", "bbt")),
         *(f"tiny_{method}_evolution_task1.png" for method in ("ucb", "bbt")),
         *(f"tiny_{method}_known_task1.png" for method in ("ucb", "bbt")),
         *(f"tiny_{method}_episode_task1.gif" for method in ("ucb", "bbt")),
@@ -167,6 +169,7 @@ def test_results_of_several_worlds_are_drawn_world_by_world(
         "tiny_short_and_long.png",
         "tiny_ucb_evolution_task0.png",
         "tiny_ucb_known_task0.png",
+        "tiny_ucb_episodes.png",
         "tiny_ucb_episode_task0.gif",
     }
 

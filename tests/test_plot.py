@@ -185,6 +185,39 @@ def test_paths_are_drawn_along_cells():
     np.testing.assert_array_equal(line.get_xydata(), [[3, 5], [3, 4], [4, 4]])  # x is the column
 
 
+@pytest.mark.parametrize("paths", [[], [np.array([[29, 15], [27, 15]])]])
+def test_goals_in_a_large_maze_are_dots_below_paths(paths):
+    side, start, goal = 31, (29, 15), (1, 1)
+    goals = np.array([[27, 15], [40, 3], [5, 7], goal]) / side
+    ax = Figure().add_subplot()
+    maze.draw_maze(ax, np.zeros((side, side)), start, goal, goals, paths=paths)
+    dots = [patch for patch in ax.patches if isinstance(patch, Circle) and patch.zorder < 1]
+    assert [dot.center for dot in dots] == [(15, 27), (7, 5)]
+    assert all(dot.zorder < line.zorder for dot in dots for line in ax.lines if paths)
+    (line,) = ax.lines  # without a path, the goals in their order
+    if not paths:
+        np.testing.assert_array_equal(line.get_ydata(), [29, 27, 5, 1])
+    assert {"S", "T", "2"} <= {patch.get_label() for patch in ax.patches}
+
+
+def test_a_bar_without_goals_is_only_room():
+    ax, _ = drawn(prompt_goals=np.array([[3, 1]]) / SIDE, lanes=1)
+    assert not any(type(patch) is Rectangle for patch in ax.patches)
+    assert ax.get_xlim()[1] > SIDE
+
+
+def test_a_shortest_path_follows_the_walk_where_it_can():
+    walk = np.array([START, (4, 3), (4, 4), (4, 5), (3, 5), (2, 5), GOAL])
+    np.testing.assert_array_equal(maze.shortest_path(MAZE, START, GOAL, walk), walk)
+    other = maze.shortest_path(MAZE, START, GOAL, walk[:1])
+    assert len(other) == len(walk)
+    assert (np.abs(np.diff(other, axis=0)).sum(axis=1) == 1).all()
+    assert not MAZE[tuple(other.T)].any()
+    walled = MAZE.copy()
+    walled[3] = 1
+    np.testing.assert_array_equal(maze.shortest_path(walled, START, GOAL, walk), [START])
+
+
 def test_gif_shows_every_step(tmp_path):
     walk = np.array([START, (4, 3), (3, 3), (3, 4), (3, 5)])
     panels = [maze.Panel("", walk[:3]), maze.Panel("a prompt", walk, np.array([[3, 3]]) / SIDE)]
@@ -307,11 +340,11 @@ def test_a_place_from_a_file_is_not_imported():
 
 def test_nothing_is_drawn_before_it_is_written(monkeypatch, tmp_path):
     drawn = []
-    for name in ("prompts", "evolution", "short_and_long", "video"):
+    for name in ("prompts", "evolution", "short_and_long", "episodes", "video"):
         monkeypatch.setattr(offered, name, lambda *args, name=name: drawn.append(name) or Figure())
     results = {"ucb": fake_results()}
     planned = list(figures.figures_of_results(PICTURES, results, lambda result: PLAY, (1,), 0))
-    assert len(planned) == 4
+    assert len(planned) == 5
     assert drawn == []
     write_all(tmp_path, planned[:1])
     assert drawn == ["prompts"]
@@ -329,6 +362,23 @@ def test_final_prompts_of_all_methods_share_a_maze():
     assert discs[1][2] > SIDE - 0.5  # in the bar
     legend = [text.get_text() for text in figure.legends[0].get_texts()]
     assert legend == ["MGPO-UCB", "BBT"]
+
+
+def test_episodes_of_methods_stand_in_rows(key):
+    results = {"ucb": fake_results(), "bbt": fake_results("bbt")}
+    players = dict.fromkeys(results, PLAY)
+    figure = rollouts.methods(PICTURES, results, players, (0, 1), 0, key)
+    assert [ax.get_ylabel() for ax in figure.axes] == ["MGPO-UCB", "", "BBT", ""]
+    minus = "return \N{MINUS SIGN}0.60"
+    assert [ax.get_title() for ax in figure.axes] == [
+        f"task 0 (optimum 0.50)\n{minus}",
+        f"task 1 (optimum 0.70)\n{minus}",
+        minus,
+        minus,
+    ]
+    walked, shortest = figure.axes[0].lines
+    assert len(walked.get_xydata()) == 7  # six steps
+    assert len(shortest.get_xydata()) == 7
 
 
 def test_visits_are_counted_per_episode(key):
@@ -418,8 +468,10 @@ def test_everything_that_a_world_draws(tmp_path):
     methods = ("ucb", "ucb_1", "bbt")
     assert set(write_all(tmp_path, drawn)) == {
         "prompts.png",
+        "methods.png",
         "short_and_long.png",
         *(f"{method}_evolution_task1.png" for method in methods),
+        *(f"{method}_episodes.png" for method in methods),
         *(f"{method}_episode_task1.gif" for method in methods),
     }
     picture = iio.imread(tmp_path / "prompts.png")

@@ -1,7 +1,8 @@
 """Pictures of mazes: walls, visits, paths, prompts, and GIFs of episodes.
 
 Positions are (row, column). Markers and labels are drawn in units of cells, so that they keep their places
-and proportions at every figure size.
+and proportions at every figure size. In large mazes, whose cells are too small for numbers, the goals of a
+prompt are dots.
 """
 
 from __future__ import annotations
@@ -9,8 +10,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -24,6 +26,7 @@ from envs.drawing.palette import (
     BAR_COLOR,
     BLUE,
     FREE_COLOR,
+    ORANGE,
     PAPER,
     VERMILION,
     WALL_COLOR,
@@ -31,18 +34,23 @@ from envs.drawing.palette import (
 )
 from envs.drawing.pictures import Pictures, Shown
 from envs.drawing.video import axes_in_a_row, write_gif
-from envs.maze.env import MazeRunner
+from envs.maze.bitboard import distances
+from envs.maze.env import MOVES, MazeRunner
 
 Cell = tuple[int, int] | np.ndarray  # row, column
 
 PROMPT_COLOR = VERMILION
 AGENT_COLOR = BLUE
+SHORTEST_COLOR = ORANGE
 START_COLOR = PAPER
 GOAL_COLOR = YELLOW
 SEEN_ON_DARK = (Stroke(linewidth=2.6, foreground="white"), Normal())
 VISIT_COLORS = LinearSegmentedColormap.from_list(
     "visits", ["#EAE6F3", "#C3B7DC", "#9A86C2", "#704FA3", "#48237F", "#260B4D"]
 )
+
+LARGEST_NUMBERED = 20  # side of the largest maze whose goals are drawn with their numbers
+DOT_RADIUS = 0.62  # of a goal in a larger maze, in cells
 
 BAR_GAP = 0.6  # distance in cells between the maze and the bar that shows goals outside of it
 BAR_LANE, BAR_ROW = 1.7, 1.35  # width and height of a marker's place in that bar, in marker units
@@ -55,6 +63,7 @@ def maze_pictures(env: MazeRunner) -> Pictures:
         prompts=partial(draw_prompts, start),
         visits=partial(draw_visits, start),
         known=partial(draw_known, start),
+        episodes=partial(draw_episodes, start),
         video=partial(write_video, start),
         panel=(1.9, 2.1),
     )
@@ -96,25 +105,42 @@ def draw_known(
     shown: Sequence[Shown],
     reached: Sequence[np.ndarray],
 ) -> ScalarMappable:
-    """Each prompt on its maze, with the path of its episode and the number of earlier visits to each
-    cell."""
+    """Each prompt on its maze, with the path of its episode, the number of earlier visits to each cell, and
+    a shortest path."""
     counts = [reached_counts(goals, task.maze) for goals, task in zip(reached, tasks, strict=True)]
     norm = visit_norm(*counts)
     lanes = max(bar_lanes(len(tasks[0].maze), [each.goals]) for each in shown)
     for ax, task, each, visits in zip(axes, tasks, shown, counts, strict=True):
-        walk = walk_of(each.episode, len(task.maze), start)
-        draw_maze(
-            ax,
-            task.maze,
-            start,
-            task.goal,
-            each.goals,
-            visits=visits,
-            paths=[walk],
-            norm=norm,
-            lanes=lanes,
-        )
+        _draw_episode(start, ax, task, each, lanes, visits=visits, norm=norm)
     return visit_scale(norm)
+
+
+def draw_episodes(
+    start: Cell, axes: Sequence[Axes], tasks: Sequence[Task], shown: Sequence[Shown]
+) -> None:
+    """Each prompt on its maze, with the path of its episode and a shortest path."""
+    lanes = max(bar_lanes(len(tasks[0].maze), [each.goals]) for each in shown)
+    for ax, task, each in zip(axes, tasks, shown, strict=True):
+        _draw_episode(start, ax, task, each, lanes)
+
+
+def _draw_episode(
+    start: Cell, ax: Axes, task: Task, shown: Shown, lanes: int, **visited: Any
+) -> None:
+    """A prompt on its maze, with the path of its episode and a shortest path; ``visited`` are the visits of
+    ``draw_maze`` and their color scale."""
+    walk = walk_of(shown.episode, len(task.maze), start)
+    draw_maze(
+        ax,
+        task.maze,
+        start,
+        task.goal,
+        shown.goals,
+        paths=[walk],
+        shortest=shortest_path(task.maze, start, task.goal, walk),
+        lanes=lanes,
+        **visited,
+    )
 
 
 def write_video(start: Cell, path: Path, task: Task, shown: Sequence[Shown]) -> None:
@@ -169,6 +195,21 @@ def visit_counts(episodes: Episode, maze: np.ndarray, start: Cell) -> np.ndarray
     return counts / len(goals)
 
 
+def shortest_path(maze: np.ndarray, start: Cell, goal: Cell, walk: np.ndarray) -> np.ndarray:
+    """The cells ``[n, 2]`` of a shortest path that follows a walk where it can; the start alone if there is
+    no path."""
+    left = np.asarray(distances(jnp.asarray(maze) == 0, jnp.asarray(goal)))
+    walked = {tuple(cell) for cell in np.asarray(walk).tolist()}
+    path = [(int(start[0]), int(start[1]))]
+    while left[path[-1]] > 0:
+        row, column = path[-1]
+        near = [(row + down, column + right) for down, right in MOVES]
+        inside = [cell for cell in near if min(cell) >= 0 and max(cell) < len(left)]
+        closer = [cell for cell in inside if left[cell] == left[row, column] - 1]
+        path.append(max(closer, key=lambda cell: cell in walked))
+    return np.array(path)
+
+
 def reached_counts(goals: np.ndarray, maze: np.ndarray) -> np.ndarray:
     """The number of times that each cell is among goals ``[n, 2]`` that were reached."""
     counts = np.zeros(maze.shape)
@@ -217,6 +258,7 @@ def draw_maze(
     paths: Iterable[np.ndarray] | None = None,
     norm: PowerNorm | None = None,
     lanes: int | None = None,
+    shortest: np.ndarray | None = None,
 ) -> None:
     """Draw a maze with its start S and its task goal T, and prompts, visits and paths in it.
 
@@ -226,12 +268,13 @@ def draw_maze(
       start: the cell of the start.
       goal: the cell of the task goal.
       prompt_goals: ``[k, 2]`` goals of a prompt in goal units, which are numbered in order, or several
-        prompts by color. A last goal at T is not drawn again; goals outside of the maze are drawn in a bar
-        on the right.
+        prompts by color. In a large maze they are dots, joined in order unless a path is drawn. A last goal
+        at T is not drawn again; goals outside of the maze are drawn in a bar on the right.
       visits: ``[side, side]`` number of visits to each cell; darker is more.
       paths: ``[T, 2]`` cells of walks, drawn as lines.
       norm: color scale of ``visits`` [their own range].
       lanes: number of lanes of the bar, to align pictures in a row [as many as needed].
+      shortest: ``[n, 2]`` cells of a shortest path, drawn as a dashed line above the others.
     """
     maze = np.asarray(maze)
     side = len(maze)
@@ -239,12 +282,21 @@ def draw_maze(
     lanes = bar_lanes(side, prompts.values()) if lanes is None else lanes
 
     ax.imshow(_cell_colors(maze, visits, norm), interpolation="nearest", zorder=0)
-    for path in paths or ():
+    paths = list(paths or ())
+    for path in paths:
         rows, columns = np.asarray(path, float).reshape(-1, 2).T
         ax.plot(
             columns, rows, color=AGENT_COLOR, linewidth=1.4, zorder=1, path_effects=SEEN_ON_DARK
         )
-    _draw_markers(ax, side, _markers(side, start, goal, prompts), lanes)
+    if shortest is not None:
+        rows, columns = shortest.T
+        ax.plot(
+            columns, rows, color=SHORTEST_COLOR, linewidth=1.1, linestyle=(0, (2, 2)), zorder=1.2
+        )
+    markers = _markers(side, start, goal, prompts)
+    if side > LARGEST_NUMBERED:
+        markers = _draw_dots(ax, markers, start, goal, joined=not paths)
+    _draw_markers(ax, side, markers, lanes)
 
     right = picture_width(side, lanes) - 0.5
     ax.set(xlim=(-0.5, right), ylim=(side - 0.5, -0.5), xticks=[], yticks=[], aspect="equal")
@@ -326,6 +378,26 @@ def _markers(
     return markers
 
 
+def _draw_dots(
+    ax: Axes, markers: list[_Marker], start: Cell, goal: Cell, joined: bool
+) -> list[_Marker]:
+    """Draw the goals inside of the maze as dots below paths, and return the other markers.
+
+    If they are ``joined``, a thin line leads from the start over the goals of each prompt to its last one.
+    """
+    dots = [marker for marker in markers if marker.shape == "disc" and marker.cell is not None]
+    for marker in dots:
+        row, column = marker.cell or (0, 0)
+        dot = Circle((column, row), DOT_RADIUS, facecolor=marker.color, edgecolor=PAPER)
+        dot.set(linewidth=0.6, zorder=0.8)
+        ax.add_patch(dot)
+    for color in dict.fromkeys(marker.color for marker in dots if joined):
+        way = [start, *(dot.cell for dot in dots if dot.color == color and dot.cell), goal]
+        rows, columns = np.asarray(way, float).T
+        ax.plot(columns, rows, color=color, linewidth=0.9, zorder=0.7)
+    return [marker for marker in markers if marker not in dots]
+
+
 def _draw_markers(ax: Axes, side: int, markers: list[_Marker], lanes: int) -> None:
     unit = _unit(side)
     inside = [marker for marker in markers if marker.cell is not None]
@@ -338,10 +410,11 @@ def _draw_markers(ax: Axes, side: int, markers: list[_Marker], lanes: int) -> No
             draw_leader(ax, home, center)
         _draw_marker(ax, marker, center[1], center[0], unit)
 
-    if lanes:
+    outside = [marker for marker in markers if marker.cell is None]
+    if outside:
         left, width = side - 0.5 + BAR_GAP, lanes * BAR_LANE * unit
-        ax.add_patch(Rectangle((left, -0.5), width, side, facecolor=BAR_COLOR, linewidth=0))
-        outside = [marker for marker in markers if marker.cell is None]
+        height = (min(len(outside), _markers_in_lane(side)) + 0.2) * BAR_ROW * unit
+        ax.add_patch(Rectangle((left, -0.5), width, height, facecolor=BAR_COLOR, linewidth=0))
         for index, marker in enumerate(outside):
             lane, row = divmod(index, _markers_in_lane(side))
             x = left + (lane + 0.5) * BAR_LANE * unit

@@ -19,6 +19,7 @@ from experiments.figures.rollouts import (
     episodes,
     evolution,
     known,
+    methods,
     prompts,
     search,
     short_and_long,
@@ -73,6 +74,9 @@ def figures_of_results(
     if pictures.prompts:
         yield "prompts.png", later(prompts, pictures, results, which, seed)
     key = jax.random.key(seed)
+    if pictures.episodes and len(results) > 1:
+        players = {label: play_with(result) for label, result in results.items()}
+        yield "methods.png", later(methods, pictures, results, players, which, seed, key)
     for number, (name, result) in enumerate(_file_names(results).items()):
         if pictures.search:
             yield f"{name}_search.png", later(search, pictures, result, which, seed)

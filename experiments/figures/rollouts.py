@@ -29,9 +29,11 @@ if TYPE_CHECKING:
 NUM_ROLLOUTS = 64
 NUM_DRAWS = 64  # prompts drawn, of which the longest is taken
 STAGES = (1, 10, 20, 40, 100)  # episodes after which a search is drawn
-EARLY_STAGES = (1, 2, 4, 8, 16)  # episodes after which the known part of a world is drawn
+SNAPSHOTS = (1, 10, 40, 100)  # episodes after which the behavior is drawn
+EARLY_STAGES = (1, 4, 8, 16)  # episodes after which the known part of a world is drawn
 BAR_ROOM = 0.6  # width of a color bar, in inches
 LEGEND_WIDTH = 5.0  # minimum width of a figure with a legend below it, in inches
+TITLE_ROOM = 0.3  # height of a title that only the first row of panels has in full, in inches
 LABEL_ROOM = (0.9, 0.65)  # inches: width of row labels, and height of title and legend, of a search
 FRAME_HEIGHT = 200  # height that small frames are enlarged to, in pixels
 
@@ -106,7 +108,7 @@ def evolution(
     task: int,
     seed: int,
     key: jax.Array,
-    stages: Sequence[int] = STAGES,
+    stages: Sequence[int] = SNAPSHOTS,
 ) -> Figure:
     """Figures 3 and 10: the best prompt after some numbers of episodes, and where it leads the policy."""
     shown = []
@@ -189,6 +191,42 @@ def episodes(
     for ax, each in zip(axes, shown, strict=True):
         ax.set_title(each.title, pad=2)
     return figure
+
+
+@styled
+def methods(
+    pictures: Pictures,
+    results: Mapping[str, Results],
+    players: Mapping[str, Play],
+    which: Sequence[int],
+    seed: int,
+    key: jax.Array,
+) -> Figure:
+    """A greedy episode of each method, as rows, on a few tasks, under its optimized prompt."""
+    figure, axes = _panels(pictures, len(results), len(which), at_least=LEGEND_WIDTH)
+    figure.set_figheight(figure.get_figheight() - TITLE_ROOM * (len(results) - 1))
+    first = next(iter(results.values()))
+    shown = []
+    for label, result in results.items():
+        for index in which:
+            goals = _best_goals(result, seed, index)
+            folded = jax.random.fold_in(key, index)
+            played = _play_once(players[label], folded, result.task(index), goals)
+            shown.append(Shown(f"return {_mean_return(played)}", goals, played))
+    pictures.episodes(axes, len(results) * _tasks_of(first, which), shown)
+    heads = [_head(first, index) for index in which]
+    for number, (ax, each) in enumerate(zip(axes, shown, strict=True)):
+        above = f"{heads[number]}\n" if number < len(heads) else ""
+        ax.set_title(above + each.title, pad=2)
+    for ax, look in zip(axes[:: len(which)], method_styles(results).values(), strict=True):
+        ax.set_ylabel(look.name, labelpad=2)
+    return figure
+
+
+def _head(result: Results, index: int) -> str:
+    """The name of a task, with its optimum if that is known."""
+    optimum = float(result.optimal_returns[index])
+    return f"task {index}" + (f" (optimum {_signed(optimum)})" if np.isfinite(optimum) else "")
 
 
 def video(
@@ -330,7 +368,11 @@ def _title(what: str, episodes: Episode) -> str:
 
 def _mean_return(episodes: Episode) -> str:
     """The mean return of one or more episodes, for titles."""
-    return f"{np.mean(episodes.return_):.2f}".replace("-", "\N{MINUS SIGN}")
+    return _signed(float(np.mean(episodes.return_)))
+
+
+def _signed(value: float) -> str:
+    return f"{value:.2f}".replace("-", "\N{MINUS SIGN}")
 
 
 def _count(count: int, what: str) -> str:
