@@ -142,7 +142,7 @@ def test_the_published_table_is_that_of_the_results(
 ) -> None:
     monkeypatch.chdir(ROOT)
     worlds = (
-        "maze15", "maze30", "gridworld", "kitchen", "kitchen-stock", "kitchen-mjx",
+        "maze15", "maze30", "gridworld", "kitchen", "kitchen-stock", "kitchen-mjx", "radt",
         "crafter-symbolic", "crafter-map", "crafter",
     )  # fmt: skip
     methods = (
