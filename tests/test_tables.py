@@ -40,6 +40,7 @@ OTHER_SETTINGS = {  # of published results that the paper's number may not stand
     "ablations/maze15/without-prior/ptgm-goal": "kl=0",
     "ablations/gridworld/without-prior/ptgm-goal": "kl=0",
     "ablations/gridworld/spirl-sampled": "judged_by=sample",
+    "ablations/gridworld/ucb-5-goals": "max_goals=5",
     "ablations/maze15/behind-noise/plan-action": "action_noise=0.1",
     "ablations/maze15/behind-noise/plan-full": "num_states=48",
     "ablations/maze15/behind-noise/plan-obs": "obs_noise=0.02",
