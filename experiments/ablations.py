@@ -24,7 +24,7 @@ from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.paper import paper_value
 from experiments.store.presets import pretrain_preset
 from experiments.store.provenance import provenance
-from experiments.store.reproduce_settings import ReproduceConfig
+from experiments.store.reproduce_settings import TRAIN_NOTHING, ReproduceConfig
 from experiments.store.result_files import load_results
 from experiments.store.seals import write_sealed
 from experiments.store.settings import DataConfig, PretrainConfig
@@ -328,6 +328,16 @@ def files_of(config: ReproduceConfig) -> tuple[Path, Path]:
     """The files of an ablation's table and learning curves."""
     place = config.folder / config.what
     return place.with_name(f"{config.what}.md"), place.with_name(f"{config.what}.png")
+
+
+def as_text(config: ReproduceConfig, lines: Sequence[Line]) -> str:
+    """The table in Markdown, below a line that says of what it is and what its trainings cost."""
+    budget = ""
+    if config.what not in TRAIN_NOTHING:
+        steps, trajectories = config.num_steps, config.num_trajectories
+        budget = f", {steps:,} gradient steps on {trajectories:,} trajectories each"
+    who = "" if config.what == "plan" else ", UCB"
+    return f"{config.world}{who}, {config.seeds} seeds{budget}\n\n{as_table(lines)}\n"
 
 
 def as_table(lines: Sequence[Line]) -> str:

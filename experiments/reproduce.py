@@ -28,7 +28,6 @@ from experiments.store.reproduce_settings import (
     GLANCE,
     LIST,
     PICTURES,
-    TRAIN_NOTHING,
     ReproduceConfig,
     check_reproduction,
 )
@@ -130,18 +129,13 @@ def make_ablation(config: ReproduceConfig) -> None:
     """Make an ablation in one world."""
     if not os.path.isdir(config.folder):
         check_place(config.folder)
-    from experiments.ablations import as_table, files_of, save
+    from experiments.ablations import as_text, files_of, save
     from experiments.ablations import make as make_lines
     from experiments.store.seals import check_replaceable
 
     check_replaceable(files_of(config))
     lines = make_lines(config)
-    budget = ""
-    if config.what not in TRAIN_NOTHING:
-        steps, trajectories = config.num_steps, config.num_trajectories
-        budget = f", {steps:,} gradient steps on {trajectories:,} trajectories each"
-    who = "" if config.what == "plan" else ", UCB"
-    text = f"{config.world}{who}, {config.seeds} seeds{budget}\n\n{as_table(lines)}\n"
+    text = as_text(config, lines)
     say(text)
     save(config, text, lines)
     print(f"table and curves in {files_of(config)[0]} and .png", file=sys.stderr)

@@ -131,7 +131,7 @@ class Compiling:
         if not self._marker.exists():
             text = (
                 f"{self.what}: compiling first, which can take some minutes; the next time, programs come "
-                "from the cache (if XLA warns of a very slow compile, that is no error)"
+                "from the cache (if XLA warns of a very slow compile, that is harmless)"
             )
             print(text, file=sys.stderr)
 
