@@ -376,7 +376,8 @@ def test_ablations_run_and_are_no_better(tasks, finals, features):
     optimum = np.asarray(jax.vmap(WORLD.optimal_return)(tasks))
     result, returns = adapted(tasks, features)
     prompts, others = (each.log.choices.prompt.goals for each in (result, finals[0]))
-    assert (prompts != others).any()
+    # In these mazes rehearsed prompts suffice, so nothing is left to steer (but see the test of steering).
+    assert (prompts != others).any() == bool(features.steering)
     assert np.mean(optimum - returns) >= np.mean(optimum - finals[1]) - 0.02
 
 
