@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mgpo_jax.optimizers.arms import Arms, insert_arm, update_arm
+from mgpo_jax.optimizers.ucb import upper_confidence_bounds
 from mgpo_jax.prompts import Prompt
 from mgpo_jax.rollout import Query
 from mgpo_jax.trees import choose
@@ -49,13 +50,12 @@ def mean_steps(
 
 
 def most_promising(prompts: Arms) -> Prompt:
-    """The prompt with the highest upper bound on its mean return, as in UCB1.
+    """The prompt with the highest upper confidence bound, as UCB chooses it.
 
-    The unit of the bound is the standard deviation of all returns in the table.
+    The unit of the bound is the standard deviation of all returns in the table, and c is that of UCB1.
     """
     num = jnp.maximum(jnp.sum(prompts.pulls), 1)
     overall = jnp.sum(prompts.pulls * prompts.mean) / num
     between = prompts.pulls * (prompts.mean - overall) ** 2
     std = jnp.sqrt(jnp.sum(prompts.sum_sq + between) / num)
-    bound = prompts.mean + std * jnp.sqrt(jnp.log(num) / jnp.maximum(prompts.pulls, 1))
-    return prompts.prompt(jnp.argmax(jnp.where(prompts.taken, bound, -jnp.inf)))
+    return prompts.prompt(jnp.argmax(upper_confidence_bounds(prompts, 2**0.5, std)))
