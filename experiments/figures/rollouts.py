@@ -202,7 +202,10 @@ def methods(
     seed: int,
     key: jax.Array,
 ) -> Figure:
-    """A greedy episode of each method, as rows, on a few tasks, under its optimized prompt."""
+    """An episode of each method, as rows, on a few tasks, under its optimized prompt.
+
+    They are played as the world judges policies.
+    """
     figure, axes = _panels(pictures, len(results), len(which), at_least=LEGEND_WIDTH)
     figure.set_figheight(figure.get_figheight() - TITLE_ROOM * (len(results) - 1))
     first = next(iter(results.values()))
