@@ -82,14 +82,9 @@ def check_data(config: CheckDataConfig) -> None:
 def show_info(config: InfoConfig) -> None:
     """Describe a dataset: counts, lengths, shapes, spreads, sizes, and origin."""
     folder = require_folder(config.folder, "info")
-    if config.json:
-        from experiments.describing import facts_of
+    from experiments.describing import described, facts_of
 
-        say(json.dumps(facts_of(folder), indent=2))
-        return
-    from experiments.soundness import described
-
-    say(described(folder))
+    say(json.dumps(facts_of(folder), indent=2) if config.json else described(folder))
 
 
 RUNS: dict[str, Callable[[Any], None]] = {

@@ -1,4 +1,4 @@
-"""Find faults in a dataset, and describe it.
+"""Find faults in a dataset.
 
 A fault is something that a training should not learn from; a note is something that may be intended. Both
 are sentences that name the trajectory and the step. ``_misaligned`` and ``_wrong_ends`` explain their
@@ -9,18 +9,16 @@ from __future__ import annotations
 
 import hashlib
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 import envs
 from envs.base import EnvSpec
-from envs.errors import printable
 from experiments import dropped_ends
-from mgpo_jax.dataset import STEP_ARRAYS, Dataset, load_dataset
+from mgpo_jax.dataset import Dataset, load_dataset
 from mgpo_jax.manifest import Facts, read_facts, read_manifest
 from mgpo_jax.mapped import let_go
 
@@ -97,7 +95,7 @@ def _not_finite(dataset: Dataset, found: Findings) -> None:
     for name, array in dataset.arrays.items():
         if array.dtype.kind != "f":
             continue
-        for first, piece in _pieces(array):
+        for first, piece in pieces(array):
             flat = piece.reshape(len(piece), -1)
             for row in np.flatnonzero(~np.isfinite(flat).all(axis=1)):
                 value = flat[row][~np.isfinite(flat[row])][0]
@@ -116,7 +114,7 @@ def _not_finite(dataset: Dataset, found: Findings) -> None:
                     )
 
 
-def _pieces(array: np.ndarray, size: int = 1 << 24) -> Iterator[tuple[int, np.ndarray]]:
+def pieces(array: np.ndarray, size: int = 1 << 24) -> Iterator[tuple[int, np.ndarray]]:
     """Yield an array in pieces, each with the index of its first row, to save memory."""
     rows = max(1, size // max(1, array[:1].nbytes))
     for first in range(0, len(array), rows):
@@ -311,109 +309,3 @@ def _idle_goals(dataset: Dataset, found: Findings) -> None:
         place = found.faults if len(bad) > 0.5 * len(dataset) else found.notes
         for index in bad.tolist():
             place[kind].append(f"trajectory {index}, step 0: {text}")
-
-
-def described(folder: Path) -> str:
-    """A description of a dataset for a person to read.
-
-    Raises:
-      DataError: if it is not a dataset, or is damaged.
-    """
-    facts = read_facts(folder)
-    dataset, manifest = load_dataset(folder, any_value=True)
-    lengths = dataset.lengths
-    quartiles = ", ".join(f"{q:g}" for q in np.percentile(lengths, [0, 25, 50, 75, 100]))
-    num = facts.num_actions
-    rows = [
-        ("dataset", f"{folder}, SHA-256 {manifest['sha256'][:16]}.."),
-        ("made by", _made_by(manifest)),
-        ("trajectories", f"{len(dataset):,} with {facts.num_steps:,} steps"),
-        (
-            "lengths",
-            f"mean {lengths.mean():.1f}; quartiles {quartiles}; horizon {facts.spec.horizon}",
-        ),
-        ("observations", f"{facts.obs_dtype}{list(facts.obs_shape)}, {_spread(dataset.obs)}"),
-        ("actions", f"{num} discrete" if num else f"{facts.action_dim} numbers in [-1, 1]"),
-        ("  spread", _counts(dataset.actions, num) if num else _spread(dataset.actions)),
-        ("goals", f"{facts.goal_dim} numbers, {_spread(dataset.achieved_goals)}"),
-        ("  reached", f"at {float(np.mean(dataset.goal_reached)):.1%} of the steps"),
-        ("returns", _returns(dataset)),
-        ("ends", _ends(dataset) + dropped_ends.in_words(read_manifest(folder)[1].dropped_ends)),
-        ("size", _size(folder, dataset)),
-    ]
-    if facts.spec.action_low:
-        bounds = ", ".join(
-            f"[{low:g}, {high:g}]"
-            for low, high in zip(facts.spec.action_low, facts.spec.action_high, strict=True)
-        )
-        rows.insert(7, ("  were", f"{bounds} in the logs"))
-    return "\n".join(f"{name:<14}{printable(text)}" for name, text in rows)
-
-
-def _made_by(manifest: Mapping[str, Any]) -> str:
-    made = manifest.get("imported")
-    if isinstance(made, dict):
-        who = made.get("author") or made.get("by") or "somebody"
-        return f"{who}: {made.get('kind')} {made.get('source')}, goals {made.get('goal')}"
-    if "policy" in manifest:
-        return f"{manifest['policy']} in {manifest.get('env')}, seed {manifest.get('seed')}"
-    return "not known"
-
-
-def _spread(array: np.ndarray) -> str:
-    """The range, mean and standard deviation of all numbers in an array, in words."""
-    low, high, total, squares, num = np.inf, -np.inf, 0.0, 0.0, 0
-    for _, piece in _pieces(array):
-        rows = piece.astype(np.float64)
-        low, high = min(low, rows.min()), max(high, rows.max())
-        total, squares, num = total + rows.sum(), squares + (rows**2).sum(), num + rows.size
-    mean = total / num
-    std = max(squares / num - mean**2, 0.0) ** 0.5
-    return f"from {low:.4g} to {high:.4g}, mean {mean:.4g}, standard deviation {std:.4g}"
-
-
-def _counts(actions: np.ndarray, num: int) -> str:
-    shares = np.bincount(np.asarray(actions), minlength=num) / len(actions)
-    text = ", ".join(f"{index} {share:.1%}" for index, share in enumerate(shares[:20]))
-    return f"{text}, .." if num > 20 else text
-
-
-def returns_of(dataset: Dataset) -> np.ndarray | None:
-    """The return of each trajectory; None without rewards."""
-    if dataset.rewards is None:
-        return None
-    return np.add.reduceat(np.asarray(dataset.rewards, np.float64), dataset.starts)
-
-
-def num_ends(dataset: Dataset) -> dict[str, int] | None:
-    """The number of trajectories that ended in each way; None if it is not known."""
-    if dataset.terminated is None or dataset.truncated is None:
-        return None
-    neither = ~dataset.terminated & ~dataset.truncated
-    ways = {"terminated": dataset.terminated, "truncated": dataset.truncated, "neither": neither}
-    return {way: int(rows.sum()) for way, rows in ways.items()}
-
-
-def _returns(dataset: Dataset) -> str:
-    if (returns := returns_of(dataset)) is None:
-        return "not known, since there are no rewards"
-    quartiles = ", ".join(f"{q:.4g}" for q in np.percentile(returns, [0, 25, 50, 75, 100]))
-    return f"mean {returns.mean():.4g}; quartiles {quartiles}"
-
-
-def _ends(dataset: Dataset) -> str:
-    nums = num_ends(dataset)
-    return "not known" if nums is None else ", ".join(f"{num} {way}" for way, num in nums.items())
-
-
-def _size(folder: Path, dataset: Dataset) -> str:
-    on_disk = sum(path.stat().st_size for path in Path(folder).iterdir() if path.is_file())
-    arrays = dataset.arrays
-    mapped = {
-        n: a
-        for n, a in arrays.items()
-        if isinstance(a, np.memmap) and n in (*STEP_ARRAYS, "rewards")
-    }
-    in_memory = sum(a.nbytes for a in arrays.values())
-    text = f"{on_disk / 1e6:,.2f} MB on disk, {in_memory / 1e6:,.2f} MB as arrays"
-    return f"{text}, which are mapped and not read" if mapped else f"{text}, which are in memory"

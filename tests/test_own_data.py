@@ -13,9 +13,10 @@ import pytest
 
 from envs.errors import DataError, UsageError
 from experiments import runtime
+from experiments.describing import described
 from experiments.dropped_ends import wrong_ends
 from experiments.importing import import_dataset
-from experiments.soundness import described, examine
+from experiments.soundness import examine
 from experiments.store.data_settings import ImportConfig, check_import
 from mgpo_jax.dataset import load_dataset, save_dataset
 from mgpo_jax.files import hash_file
