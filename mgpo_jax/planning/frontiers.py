@@ -1,5 +1,5 @@
-"""Exploration: frontiers, states from which the task goal could be reached sooner than by any known
-path."""
+"""Exploration: random goals outside of the map, which draw the agent into unknown parts of the world, and
+frontiers, states from which the task goal could be reached sooner than by any known path."""
 
 from __future__ import annotations
 
@@ -8,12 +8,33 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from mgpo_jax.optimizers.base import SearchSpace
-from mgpo_jax.planning.table import FAR, UNKNOWN, Table, steps_from, way_to
-from mgpo_jax.prompts import Prompt, sample_prompt
+from mgpo_jax.planning.table import FAR, UNKNOWN, Table, find_state, steps_from, way_to
+from mgpo_jax.prompts import Prompt, sample_prompt, single_goal
 
+NUM_DRAWN = 32
+"""Number of random goals of which one outside of the map is kept."""
 # The cost of a frontier, in steps, beyond the estimated length of a path through it: for every time that it
 # was chosen before, for every visit (up to ``MOST_VISITS``), and the scale of a random term.
 COST_OF_CHOICE, COST_OF_VISIT, MOST_VISITS, CHANCE = 2.0, 0.15, 20, 0.7
+
+
+def prompt_elsewhere(
+    key: PRNGKeyArray, space: SearchSpace, table: Table, task_goal: Float[Array, "G"]
+) -> Prompt:
+    """A prompt of two goals: a random one that was not reached yet, and the task goal.
+
+    If all of ``NUM_DRAWN`` random goals were reached before, the first of them is used. There must be room
+    for two goals.
+    """
+    drawn = jax.vmap(space.sample_goal)(jax.random.split(key, NUM_DRAWN))
+    reached = jax.vmap(lambda goal: find_state(table, goal) != UNKNOWN)(drawn)
+    return followed_by(single_goal(drawn[jnp.argmin(reached)], space.num_slots - 1), task_goal)
+
+
+def followed_by(prompt: Prompt, task_goal: Float[Array, "G"]) -> Prompt:
+    """A prompt with one slot more, whose last goal is the task goal."""
+    goals = jnp.concatenate([prompt.goals, task_goal[None]])
+    return Prompt(goals, jnp.append(prompt.mask, True))
 
 
 def choose_frontier(
@@ -74,4 +95,4 @@ def prompt_over(
     way = way_to(key_way, table, start, over, space.horizon)
     goal = table.goals[over]
     to = sample_prompt(key_prompt, way.goals, goal, space.num_slots - 1, space.longest - 1)
-    return Prompt(jnp.concatenate([to.goals, task_goal[None]]), jnp.append(to.mask, True))
+    return followed_by(to, task_goal)

@@ -5,8 +5,9 @@ The first episode evaluates (g^M). Every later episode is spent on one of three 
 - a prompt that is certainly better than the best one: its rehearsal (``planning.rehearsal``) reaches the
   task goal in fewer steps;
 - a prompt that may be better: its rehearsal leaves the map close enough to the task goal;
-- exploration: actions are sampled under a random prompt of the known path, or under one that leads to a
-  frontier, a state from which the task goal could be reached sooner than by the known path.
+- exploration, with sampled actions. Until a path to the task goal is known, the prompt names a random goal
+  that was not reached yet, and the task goal. Later it is a random prompt of the known path, or one that
+  leads to a frontier, a state from which the task goal could be reached sooner than by the known path.
 
 In the first two cases actions are greedy. A prompt of the second kind is never run twice in a row. Without
 rehearsals (an ablation) the prompts of these two kinds are random goals of the known path.
@@ -29,10 +30,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from envs.base import EnvSpec, Episode, Goals
+from envs.errors import NotAvailableError
 from mgpo_jax.adaptation import in_turn
 from mgpo_jax.optimizers.arms import Arms, empty_arms, estimated_returns, no_goals
 from mgpo_jax.optimizers.base import PromptOptimizer, SearchSpace
-from mgpo_jax.planning.frontiers import choose_frontier, prompt_over
+from mgpo_jax.planning.frontiers import choose_frontier, prompt_elsewhere, prompt_over
 from mgpo_jax.planning.rehearsal import Seen
 from mgpo_jax.planning.searching import (
     Features,
@@ -125,7 +127,7 @@ def plan_map(
     if space.num_slots == 1:  # (g^M) is the only prompt, so there is nothing to search
         features = Features(rounds=0, steering=0, splice=features.splice, frontier=False)
     world = Seen(spec, spec.horizon)
-    tools = Tools(space, world, policy, features)
+    tools = Tools(space, world, policy, features, draws_goals(space))
     num_arms = min(NUM_ARMS, space.num_episodes)
 
     def init(key: PRNGKeyArray, task_goal: Float[Array, "G"]) -> MapState:
@@ -224,6 +226,15 @@ def _next_query(tools: Tools, key: PRNGKeyArray, state: MapState) -> tuple[Query
     )
 
 
+def draws_goals(space: SearchSpace) -> bool:
+    """Whether the world draws random goals, which few methods need."""
+    try:
+        jax.eval_shape(space.sample_goal, jax.random.key(0))
+    except NotAvailableError:
+        return False
+    return True
+
+
 def lies_beyond(state: MapState, way: Way) -> Bool[Array, ""]:
     """Whether the map is full and the best episode reached the task goal sooner than any path in the
     map."""
@@ -236,28 +247,33 @@ def explore(
 ) -> tuple[Prompt, Int[Array, ""]]:
     """A prompt to explore with, and the frontier that it leads to (``UNKNOWN`` for none).
 
-    The prompt holds random goals of the known path, or of the latest episode if no path is known. In two of
-    every four turns it leads to a frontier instead. If the best episode lies beyond the map, its goals are
-    used in every turn.
+    If no path is known, the prompt holds a random goal that was not reached yet (``prompt_elsewhere``).
+    Otherwise it holds random goals of the known path, and in two of every four turns it leads to a frontier
+    instead. If the best episode lies beyond the map, its goals are used in every turn.
     """
-    space = tools.space
+    space, table, task_goal = tools.space, state.table, state.task_goal
     key_subset, key_frontier = jax.random.split(key)
     beyond = lies_beyond(state, way)
     source = choose(way.steps < FAR, way.goals, state.latest)
     source = choose(beyond, state.best_goals, source)
-    subset = sample_prompt(key_subset, source, state.task_goal, space.num_slots, space.longest)
+    subset = sample_prompt(key_subset, source, task_goal, space.num_slots, space.longest)
+    several = (space.longest > 1) & ~beyond
+    if space.num_slots > 1 and tools.draws_goals:
+        elsewhere = prompt_elsewhere(key_subset, space, table, task_goal)
+        lost = several & (way.steps >= FAR)
+        subset = choose(lost, elsewhere, subset)
+    else:
+        lost = jnp.zeros((), bool)
     if not tools.features.frontier:
         return subset, jnp.int32(UNKNOWN)
 
     def to_frontier() -> tuple[Prompt, Array]:
-        task_goal, choices = state.task_goal, state.choices
         over = choose_frontier(
-            key_frontier, state.table, state.start, task_goal, choices, way.steps
+            key_frontier, table, state.start, task_goal, state.choices, way.steps
         )
-        prompt = prompt_over(key_subset, space, state.table, state.start, over, task_goal)
-        return prompt, over
+        return prompt_over(key_subset, space, table, state.start, over, task_goal), over
 
-    wanted = ((state.num_asked // 2) % 2 == 1) & (space.longest > 1) & ~beyond
+    wanted = several & ~lost & ((state.num_asked // 2) % 2 == 1)
     result: tuple[Prompt, Array] = jax.lax.cond(
         wanted, to_frontier, lambda: (subset, jnp.int32(UNKNOWN))
     )

@@ -70,6 +70,8 @@ class Tools(NamedTuple):
     world: Seen
     policy: Policy
     features: Features
+    draws_goals: bool = True
+    """Whether the world draws random goals (``SearchSpace.sample_goal``)."""
 
 
 class Memory(NamedTuple):
