@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from envs.base import Episode, Goals, Trajectory
+from envs.errors import NotAvailableError
 from envs.maze.env import MazeRunner, MazeTask
 from mgpo_jax.adaptation import search
 from mgpo_jax.distributions import Categorical
@@ -312,13 +313,14 @@ def adapted(
     policy=POLICY,
     num_states=100,
     deterministic=True,
+    sample_goal=WORLD.sample_goal,
 ):
     space = SearchSpace(
         num_slots=policy.num_slots,
         horizon=WORLD.horizon,
         return_range=WORLD.spec.return_range,
         num_episodes=num_episodes,
-        sample_goal=WORLD.sample_goal,
+        sample_goal=sample_goal,
         deterministic=deterministic,
     )
     optimizer = plan_map(space, WORLD.spec, policy, num_states, features)
@@ -417,6 +419,22 @@ def test_a_task_that_cannot_be_solved_ends_like_any_other(tasks):
     worst = WORLD.spec.return_range[0]
     np.testing.assert_allclose(result.log.returns, worst, atol=1e-5)
     np.testing.assert_allclose(returns, worst, atol=1e-5)
+    # After the first episode each prompt names a goal that no earlier episode reached, then the task goal.
+    prompts = result.log.choices.prompt
+    np.testing.assert_array_equal(np.asarray(prompts.mask)[0, 1:].sum(axis=-1), 2)
+    named = np.asarray(prompts.goals)[0, :, -2]
+    reached = np.asarray(result.log.played.goals.achieved_goals)[0, :, 0]
+    for turn in range(1, 8):
+        assert np.abs(reached[:turn] - named[turn]).sum(axis=-1).min() > 1e-3
+    assert len(np.unique(named[1:], axis=0)) > 3
+
+
+def test_in_a_world_that_draws_no_goals_it_explores_by_those_it_has_seen(tasks):
+    def sample_goal(key):
+        raise NotAvailableError("this maze draws no goals at random")
+
+    _, returns = adapted(tasks, num_episodes=10, sample_goal=sample_goal)
+    assert np.isfinite(returns).all()
 
 
 class TestTrialsUnderNoise:
