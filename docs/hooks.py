@@ -25,6 +25,8 @@ PAGES = {
 """Files of the repository that are pages of the site under another name."""
 MODULES = (
     "envs.base",
+    "envs.specs",
+    "envs.agents",
     "envs.registry",
     "envs.gymnasium_world",
     "envs.live",

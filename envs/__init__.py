@@ -8,26 +8,17 @@ Importing this package does not import jax; the records of an episode are loaded
 
 from __future__ import annotations
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
 from envs.compiler import avoid_fault
 from envs.registry import Judgement, World, find, make, names, register
 
 if TYPE_CHECKING:
-    from envs.base import (
-        Agent,
-        ArraySpec,
-        Box,
-        Demonstrator,
-        Discrete,
-        Engine,
-        Environment,
-        EnvSpec,
-        Episode,
-        TimeStep,
-        Trajectory,
-    )
+    from envs.agents import Agent, Demonstrator
+    from envs.base import Environment, Episode, TimeStep, Trajectory
     from envs.checks import check_world
+    from envs.specs import ArraySpec, Box, Discrete, Engine, EnvSpec
 
 avoid_fault()
 
@@ -53,13 +44,24 @@ __all__ = [
 ]
 
 
+_PLACE_OF = {
+    "Agent": "envs.agents",
+    "ArraySpec": "envs.specs",
+    "Box": "envs.specs",
+    "Demonstrator": "envs.agents",
+    "Discrete": "envs.specs",
+    "Engine": "envs.specs",
+    "EnvSpec": "envs.specs",
+    "Environment": "envs.base",
+    "Episode": "envs.base",
+    "TimeStep": "envs.base",
+    "Trajectory": "envs.base",
+    "check_world": "envs.checks",
+}
+"""Names that are loaded when they are first used, and their modules."""
+
+
 def __getattr__(name: str) -> Any:
-    if name == "check_world":
-        from envs.checks import check_world
-
-        return check_world
-    if name in __all__:
-        from envs import base
-
-        return getattr(base, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in _PLACE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_PLACE_OF[name]), name)

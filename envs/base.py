@@ -1,7 +1,7 @@
 """The records of an episode, and the interface of a world (environment).
 
-A world consists of a static spec and pure functions of traced tasks and states. Everything is written for
-one episode; ``jax.vmap`` adds the axes of batches, tasks and seeds.
+A world consists of a static spec (``envs.specs``) and pure functions of traced tasks and states. Everything
+is written for one episode; ``jax.vmap`` adds the axes of batches, tasks and seeds.
 
 Axes in shapes: T time steps, D components of an observation, G components of a goal, A components of an
 action, N tasks.
@@ -9,7 +9,6 @@ action, N tasks.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -19,127 +18,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
 
 from envs.errors import NotAvailableError
+from envs.specs import Engine, EnvSpec
 
 Task = Any  # a pytree of arrays: a maze and a goal, an order of subtasks, the seed of a map ...
 State = Any  # a pytree of arrays
-
-
-@dataclass(frozen=True)
-class ArraySpec:
-    """Shape and dtype of an array."""
-
-    shape: tuple[int, ...]
-    dtype: str = "float32"
-
-    @property
-    def size(self) -> int:
-        return int(np.prod(self.shape, dtype=np.int64))
-
-    @property
-    def is_float(self) -> bool:
-        return np.issubdtype(np.dtype(self.dtype), np.floating)
-
-    def __str__(self) -> str:
-        return f"{self.dtype}{list(self.shape)}"
-
-
-@dataclass(frozen=True)
-class Discrete:
-    """Actions are the integers 0 to ``num`` - 1."""
-
-    num: int
-
-
-@dataclass(frozen=True)
-class Box:
-    """Actions are ``size`` numbers in [-1, 1]."""
-
-    size: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class ObsLayout:
-    """The meaning of the numbers in a flat observation, if some of them are categorical codes or counts.
-
-    The codes of ``num_cells`` cells come first, then ``num_counts`` counts, then plain numbers. The code of
-    a cell combines several digits d_0, d_1, .., such as the block in the cell and the creature on it. It is
-    d_0 + code_sizes[0] * (d_1 + code_sizes[1] * (d_2 + ..)).
-
-    Attributes:
-      num_cells: number of cells.
-      code_sizes: number of values of each digit of a code; a single size if codes are not divided into
-        digits.
-      num_counts: number of counts.
-      max_count: the largest count; counts are integers from 0.
-    """
-
-    num_cells: int
-    code_sizes: tuple[int, ...]
-    num_counts: int
-    max_count: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class EnvSpec:
-    """The static specification of a world.
-
-    Attributes:
-      name: the name of the world in messages and file names.
-      obs: shape and dtype of an observation.
-      goal_dim: size G of a goal.
-      actions: the action space.
-      horizon: number of steps after which an episode is truncated.
-      return_range: smallest and largest possible return, by which optimizers scale returns.
-      truncate_in_hindsight: whether a trajectory that is cut at any step is a demonstration of another task
-        goal (paper, appendix D: true in MazeRunner, where every position is a goal).
-      deterministic: whether the task and the actions determine an episode. If not, the return of one greedy
-        episode is only a sample from the return distribution of a prompt.
-      reward_confirms_goals: whether a reward at a goal means that this goal was the right one at this
-        point, as in worlds that reward a sequence part by part.
-      goals_are_states: whether the achieved goal determines the state of a task, as far as a policy can
-        distinguish states. Then the observations of several episodes can be combined into one map.
-      layout: the meaning of an observation's numbers, for encoders that embed codes and counts [all are
-        plain numbers].
-    """
-
-    name: str
-    obs: ArraySpec
-    goal_dim: int
-    actions: Discrete | Box
-    horizon: int
-    return_range: tuple[float, float]
-    truncate_in_hindsight: bool = False
-    deterministic: bool = True
-    reward_confirms_goals: bool = False
-    goals_are_states: bool = False
-    layout: ObsLayout | None = None
-
-    @property
-    def discrete(self) -> bool:
-        return isinstance(self.actions, Discrete)
-
-    @property
-    def action_dim(self) -> int:
-        """The number of discrete actions, or the size A of a continuous one."""
-        return self.actions.num if isinstance(self.actions, Discrete) else self.actions.size
-
-    def zero_action(self) -> Array:
-        """An action of the right shape and dtype."""
-        return jnp.zeros((), jnp.int32) if self.discrete else jnp.zeros(self.action_dim)
-
-
-@dataclass(frozen=True)
-class Engine:
-    """Requirements of a world's simulation engine on the compiled programs that step it.
-
-    Attributes:
-      worlds_together: smallest efficient batch of worlds in a step, for engines with a high overhead per
-        call.
-      compiler_options: XLA options for such programs, as pairs of name and value.
-    """
-
-    worlds_together: int = 1
-    compiler_options: tuple[tuple[str, bool], ...] = ()
 
 
 class TimeStep(NamedTuple):
@@ -399,63 +281,3 @@ def _kind(dtype: np.dtype) -> str:
     """The kind of values in arrays of a dtype, as a word for messages."""
     kinds = {"b": "booleans", "i": "integers", "u": "integers", "f": "numbers"}
     return kinds.get(dtype.kind, str(dtype))
-
-
-def keeps_its_size(memory: Any, num_steps: int) -> Any:
-    """The ``grow`` of agents whose memory has a fixed size: returns the memory unchanged."""
-    del num_steps
-    return memory
-
-
-class Agent(NamedTuple):
-    """An agent that acts in an episode, such as a policy under a prompt, or the demonstrator of a dataset.
-
-    ``begin`` and ``proceed`` return ``(action, quits, memory)``. An agent that quits ends the episode
-    before the action is taken.
-    """
-
-    begin: Callable
-    """``(key, task, state, timestep) -> (action, quits, memory)`` at the start of an episode."""
-    proceed: Callable
-    """``(key, memory, state, timestep) -> (action, quits, memory)`` after every step."""
-    grow: Callable = keeps_its_size
-    """``(memory, num_steps) -> memory`` with room for that many more steps."""
-    decisions: Callable = lambda memory: ()
-    """``(memory) -> decisions``: the decisions of the episode besides its actions, for agents whose
-    decisions last several steps. It is called once all episodes of a batch have ended. Until then the agent
-    continues to act, so it must store decisions by their step; those of the first ``length`` steps
-    count."""
-    intended: Callable[[Any], Array] | None = None
-    """``(memory) -> action``: the action that the agent intended in its latest ``begin`` or ``proceed``,
-    with the shape and dtype of the executed one. It is for demonstrators that sometimes execute other
-    actions, such as random ones: policies read the executed actions as history, and imitate the intended
-    ones (default: executed actions are the intended ones, and no others are kept)."""
-
-
-class Demonstrator(NamedTuple):
-    """The source of a dataset: tasks to demonstrate, and the agent that demonstrates them."""
-
-    sample_task: Callable
-    """``(key, index) -> task``: the task of the index-th demonstration."""
-    agent: Callable[[Any], Agent]
-    """``(weights) -> agent``."""
-    keeps: Callable = lambda episode: episode.trajectory.length > 0
-    """``(episode) -> bool``: whether to keep a demonstration; others are discarded and repeated."""
-    hindsight_return: Callable | None = None
-    """``(trajectory) -> return`` on the task that the trajectory accomplishes in hindsight (default: the
-    return of the episode)."""
-    weights: Any = ()
-    """Arrays that the agent is made from, such as the parameters of a network; they are traced."""
-    settings: tuple[tuple[str, float], ...] = ()
-    """Names and values of the settings that the data depend on; a dataset made with others is out of
-    date."""
-    configured: Callable[[Mapping[str, float]], Demonstrator] | None = None
-    """``(values) -> demonstrator`` with some of its settings changed; raises ``ValueError`` for a value out
-    of range. None if the settings are fixed."""
-    env: Environment | None = None
-    """The world in which it demonstrates, if that differs from the world that the data are for. Both have
-    the same observations, goals and actions, and equal tasks have equal fingerprints."""
-    variants: tuple[str, ...] = ()
-    """Names of the variants of the world, such as its scenes. Every task belongs to one variant."""
-    variant: Callable = lambda task: jnp.zeros((), jnp.int32)
-    """``(task) -> index`` into ``variants``, which a dataset stores for every trajectory."""

@@ -14,16 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PRNGKeyArray
 
-from envs.base import (
-    Agent,
-    Environment,
-    Episode,
-    State,
-    Task,
-    TimeStep,
-    Trajectory,
-    keeps_its_size,
-)
+from envs.agents import Agent, keeps_its_size
+from envs.base import Environment, Episode, State, Task, TimeStep, Trajectory
 
 # The loop runs in segments, between which the agent's memory grows. With more segments the cost of a step
 # follows the number of steps so far rather than the horizon, but compilation takes longer.

@@ -18,8 +18,9 @@ from envs.live import Act, Moment, Pool, Reading, Start, num_cores, single_envs
 from envs.registry import World
 
 if TYPE_CHECKING:
-    from envs.base import ArraySpec, Box, Demonstrator, Discrete
+    from envs.agents import Demonstrator
     from envs.hosted import Hosted
+    from envs.specs import ArraySpec, Box, Discrete
 
 Script = Callable[[Any, np.random.Generator], Act]
 """``(env, generator) -> act``: called after the reset of an episode. ``act(moment)`` then returns the next
@@ -163,7 +164,7 @@ class GymnasiumWorld:
         Raises:
           UsageError: if they are not supported.
         """
-        from envs.base import ArraySpec
+        from envs.specs import ArraySpec
 
         env, options = self._example, self.drawn_options(0)
         moment = self.reset(env, Start(0, tuple(options[name] for name in sorted(options))))
@@ -219,7 +220,7 @@ class GymnasiumWorld:
         return limit
 
     def _actions(self, space: Any) -> Discrete | Box:
-        from envs.base import Box, Discrete
+        from envs.specs import Box, Discrete
 
         kind = type(space).__name__
         if kind == "Discrete":

@@ -18,10 +18,12 @@ import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt
 
-from envs.base import Agent, Demonstrator, Engine, Environment, EnvSpec, TimeStep
+from envs.agents import Agent, Demonstrator
+from envs.base import Environment, TimeStep
 from envs.errors import NotAvailableError
 from envs.gymnasium_world import GymnasiumWorld, Shapes
 from envs.live import Pool, Reading, Start
+from envs.specs import Engine, EnvSpec
 
 MAX_SEED = 2**31 - 1
 

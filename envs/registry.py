@@ -21,10 +21,12 @@ from envs.errors import DataError, UsageError, nearest, printable, shown
 if TYPE_CHECKING:
     import numpy as np
 
-    from envs.base import Demonstrator, Environment, ObsLayout
+    from envs.agents import Demonstrator
+    from envs.base import Environment
     from envs.drawing import Pictures
     from envs.official import Official
     from envs.page import Page
+    from envs.specs import ObsLayout
 
 
 @dataclass(frozen=True)

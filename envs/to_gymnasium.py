@@ -26,9 +26,10 @@ import numpy as np
 from gymnasium import spaces
 
 import envs.registry
-from envs.base import ArraySpec, Environment, Task, TimeStep
+from envs.base import Environment, Task, TimeStep
 from envs.errors import UsageError
 from envs.registry import World
+from envs.specs import ArraySpec
 
 NAMESPACE, VERSION = "mgpo_jax", 0
 KEYS = 2**32

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from envs.base import Engine, Environment, EnvSpec, State, Task, TimeStep
+from envs.base import Environment, State, Task, TimeStep
 from envs.errors import UsageError
+from envs.specs import Engine, EnvSpec
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 import envs
-from envs.base import Demonstrator, Environment, Episode
+from envs.agents import Demonstrator
+from envs.base import Environment, Episode
 from envs.episodes import run_episode
 from envs.errors import DataError
 from experiments.demonstrators import find_demonstrator

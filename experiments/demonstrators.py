@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from envs.base import Demonstrator, Environment
+from envs.agents import Demonstrator
+from envs.base import Environment
 from envs.errors import UsageError, nearest, shown
 from envs.registry import World
 

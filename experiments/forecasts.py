@@ -12,8 +12,9 @@ import jax
 import numpy as np
 
 import envs
-from envs.base import Environment, EnvSpec, Task
+from envs.base import Environment, Task
 from envs.registry import World
+from envs.specs import EnvSpec
 from experiments.inventory import price_of, seconds_per_episode
 from experiments.networks import sized_network
 from experiments.store.adapt_settings import AdaptConfig

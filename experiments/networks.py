@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from envs.base import Environment, EnvSpec
+from envs.base import Environment
 from envs.errors import DataError, UsageError
+from envs.specs import EnvSpec
 from experiments.store import runs
 from experiments.store.initial import check_initial, initial_folder, mend_initial
 from experiments.store.settings import PretrainConfig

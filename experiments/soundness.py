@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 import envs
-from envs.base import EnvSpec
+from envs.specs import EnvSpec
 from experiments import dropped_ends
 from mgpo_jax.dataset import Dataset, load_dataset
 from mgpo_jax.manifest import Facts, read_facts, read_manifest

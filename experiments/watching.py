@@ -9,7 +9,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
-from envs.base import Demonstrator, Environment, Task
+from envs.agents import Demonstrator
+from envs.base import Environment, Task
 from envs.episodes import run_episode
 from envs.registry import World
 from mgpo_jax.kinds import MULTI_GOAL, kind_of

@@ -14,23 +14,14 @@ import os
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from envs.base import (
-        Agent,
-        ArraySpec,
-        Box,
-        Demonstrator,
-        Discrete,
-        Environment,
-        EnvSpec,
-        Episode,
-        TimeStep,
-        Trajectory,
-    )
+    from envs.agents import Agent, Demonstrator
+    from envs.base import Environment, Episode, TimeStep, Trajectory
     from envs.episodes import replay, run_episode
     from envs.errors import DataError, UsageError
     from envs.registry import Judgement, World, make
     from envs.registry import names as world_names
     from envs.registry import register as register_world
+    from envs.specs import ArraySpec, Box, Discrete, EnvSpec
     from mgpo_jax.acting import Actor
     from mgpo_jax.adaptation import Adapter, AdaptResult, search
     from mgpo_jax.dataset import Dataset, load_dataset, save_dataset
@@ -51,13 +42,12 @@ if TYPE_CHECKING:
     from mgpo_jax.training import pretrain
 
 _PLACES = {
-    "envs.base": (
-        "Agent", "ArraySpec", "Box", "Demonstrator", "Discrete", "EnvSpec", "Environment", "Episode",
-        "TimeStep", "Trajectory",
-    ),
+    "envs.agents": ("Agent", "Demonstrator"),
+    "envs.base": ("Environment", "Episode", "TimeStep", "Trajectory"),
     "envs.episodes": ("replay", "run_episode"),
     "envs.errors": ("DataError", "UsageError"),
     "envs.registry": ("Judgement", "World", "make"),
+    "envs.specs": ("ArraySpec", "Box", "Discrete", "EnvSpec"),
     "mgpo_jax.acting": ("Actor",),
     "mgpo_jax.adaptation": ("AdaptResult", "Adapter", "search"),
     "mgpo_jax.dataset": ("Dataset", "load_dataset", "save_dataset"),

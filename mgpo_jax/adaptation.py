@@ -13,8 +13,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, Shaped
 
-from envs.base import Agent, Environment, EnvSpec, Episode, Goals, Task, Trajectory
+from envs.agents import Agent
+from envs.base import Environment, Episode, Goals, Task, Trajectory
 from envs.episodes import run_episode
+from envs.specs import EnvSpec
 from mgpo_jax.prompts import hindsight_outcome
 from mgpo_jax.trees import choose, put_row
 

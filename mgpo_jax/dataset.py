@@ -16,9 +16,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from envs.base import ArraySpec, Box, Discrete, EnvSpec, Trajectory
+from envs.base import Trajectory
 from envs.errors import DataError, UsageError, shown
 from envs.registry import WORLDS
+from envs.specs import ArraySpec, Box, Discrete, EnvSpec
 from mgpo_jax.archives import read_arrays
 from mgpo_jax.array_fields import ArrayField, Sizes
 from mgpo_jax.files import hash_file, new_folder, write_arrays, write_json

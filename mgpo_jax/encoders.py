@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Shaped
 
-from envs.base import ObsLayout
 from envs.registry import Encoder
+from envs.specs import ObsLayout
 
 
 class Linear(nn.Module):

@@ -15,7 +15,7 @@ from envs.errors import UsageError
 from envs.registry import Registry, imported
 
 if TYPE_CHECKING:
-    from envs.base import Agent
+    from envs.agents import Agent
     from mgpo_jax.network_configs import NetworkConfig
 
 MULTI_GOAL = "mgpo"

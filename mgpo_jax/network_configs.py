@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from annotated_types import Ge, Gt, Le, MaxLen
 from jaxtyping import Array, Float, Int, Shaped
 
-from envs.base import ArraySpec, EnvSpec, ObsLayout
 from envs.errors import UsageError, nearest, shown
 from envs.registry import Encoder
+from envs.specs import ArraySpec, EnvSpec, ObsLayout
 from mgpo_jax.distributions import HEADS
 from mgpo_jax.schema import STRICT
 from mgpo_jax.settings import ENCODERS, NumGoals, NumLayers, Share, TokensPerStep, Width

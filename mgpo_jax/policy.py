@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from envs.base import EnvSpec
 from envs.errors import DataError
+from envs.specs import EnvSpec
 from mgpo_jax.network_configs import NetworkConfig, TransformerConfig
 from mgpo_jax.seen_goals import SeenGoals
 from mgpo_jax.transformer import GoalTransformer, grow_cache

@@ -22,9 +22,9 @@ import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 from pydantic import BaseModel
 
-from envs.base import EnvSpec
 from envs.errors import DataError, UsageError
 from envs.registry import World, find
+from envs.specs import EnvSpec
 from mgpo_jax.archives import array_names, read_arrays
 from mgpo_jax.array_fields import ArrayField
 from mgpo_jax.claims import claimed, cleaned_on_exit

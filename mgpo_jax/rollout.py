@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from envs.base import Agent, Environment, Episode, State, Task, TimeStep
+from envs.agents import Agent
+from envs.base import Environment, Episode, State, Task, TimeStep
 from envs.episodes import run_episode
 from mgpo_jax.policy import Policy
 from mgpo_jax.prompts import Prompt

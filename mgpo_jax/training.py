@@ -21,8 +21,9 @@ from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
-from envs.base import EnvSpec, Trajectory
+from envs.base import Trajectory
 from envs.errors import DataError, UsageError, nearest
+from envs.specs import EnvSpec
 from mgpo_jax import processes
 from mgpo_jax.dataset import BatchPlan, Dataset, check_dataset, plan_batches
 from mgpo_jax.kinds import kind_of

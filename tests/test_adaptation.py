@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import envs.episodes
-from envs.base import Agent
+from envs.agents import Agent
 from envs.episodes import replay, run_episode
 from envs.gridworld.env import GridWorld
 from envs.maze.env import MazeRunner

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import envs
-from envs.base import ObsLayout
 from envs.errors import UsageError
+from envs.specs import ObsLayout
 
 pytest.importorskip("craftax")
 from envs.crafter.encoding import TILE, Picture

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from envs.base import ArraySpec, Box, Discrete, EnvSpec
 from envs.errors import DataError
+from envs.specs import ArraySpec, Box, Discrete, EnvSpec
 from mgpo_jax.dataset import (
     ARRAYS,
     MANIFEST,

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs.base import ArraySpec, ObsLayout
 from envs.errors import UsageError
 from envs.maze.env import MazeRunner
+from envs.specs import ArraySpec, ObsLayout
 from envs.wrappers import Noisy, Wrapper
 from mgpo_jax.dataset import BatchPlan, Dataset, load_dataset, save_dataset
 from mgpo_jax.losses import bc_loss

@@ -16,9 +16,10 @@ import numpy as np
 import pytest
 
 import envs
-from envs.base import ArraySpec, Box, Discrete, Engine, Environment, EnvSpec
+from envs.base import Environment
 from envs.errors import NotAvailableError, UsageError
 from envs.registry import WORLDS
+from envs.specs import ArraySpec, Box, Discrete, Engine, EnvSpec
 from envs.wrappers import Noisy
 
 

@@ -11,7 +11,7 @@ import pytest
 from jax.extend.core import jaxprs_in_params
 
 import envs
-from envs.base import Agent
+from envs.agents import Agent
 from envs.episodes import MAX_SEGMENTS, num_segments, replay, run_episode
 from envs.wrappers import Noisy
 

@@ -11,10 +11,11 @@ import numpy as np
 import optax
 import pytest
 
-from envs.base import ArraySpec, Discrete, Environment, EnvSpec, Episode, TimeStep
+from envs.base import Environment, Episode, TimeStep
 from envs.episodes import run_episode
 from envs.errors import NotAvailableError, UsageError
 from envs.registry import Judgement
+from envs.specs import ArraySpec, Discrete, EnvSpec
 from mgpo_jax import methods
 from mgpo_jax.adaptation import Adapter, proceed, search, start
 from mgpo_jax.baselines import finetune

@@ -20,8 +20,8 @@ import pytest
 from hostile.work import Evaluation
 from jax.flatten_util import ravel_pytree
 
-from envs.base import ArraySpec, Discrete, EnvSpec
 from envs.errors import DataError, UsageError
+from envs.specs import ArraySpec, Discrete, EnvSpec
 from experiments import networks, runtime, training, watching
 from experiments.parsing import parse
 from experiments.store.initial import initial_at

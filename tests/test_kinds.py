@@ -12,8 +12,8 @@ import pytest
 from test_training import DATASET
 
 import envs
-from envs.base import ArraySpec, Discrete, EnvSpec
 from envs.errors import DataError, UsageError
+from envs.specs import ArraySpec, Discrete, EnvSpec
 from experiments.networks import sized_network
 from experiments.store.presets import check_pretraining, pretrain_preset
 from experiments.store.settings import PretrainConfig

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import envs
-from envs.base import Agent, Episode, Trajectory
+from envs.agents import Agent
+from envs.base import Episode, Trajectory
 from envs.episodes import run_episode
 from envs.maze.demonstrators import first_hit_return, maze_demonstrators
 from envs.maze.env import NORTH, STAY, WEST, MazeRunner, MazeTask

@@ -12,8 +12,9 @@ import pytest
 from scipy import stats
 
 import envs
-from envs.base import ArraySpec, Box, Environment, EnvSpec, ObsLayout, TimeStep
+from envs.base import Environment, TimeStep
 from envs.errors import UsageError
+from envs.specs import ArraySpec, Box, EnvSpec, ObsLayout
 from envs.wrappers import Noisy, behind_noise
 
 MAZE = envs.make("maze15")

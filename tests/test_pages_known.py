@@ -15,9 +15,9 @@ from made_results import ENV, made_results
 from pages_js import NODE, needs_node
 
 import experiments.store.results as store
-from envs.base import EnvSpec
 from envs.errors import DataError
 from envs.registry import WORLDS, World
+from envs.specs import EnvSpec
 from envs.wrappers import Wrapper
 from experiments.pages.build import SCRIPTS, Bundle, as_text
 from experiments.pages.packing import packed

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 import envs
-from envs.base import ArraySpec, Box, ObsLayout
 from envs.errors import DataError, UsageError
+from envs.specs import ArraySpec, Box, ObsLayout
 from mgpo_jax.network_configs import TransformerConfig, network_config
 from mgpo_jax.policy_files import load_policy, read_policy, save_policy
 from mgpo_jax.prompts import single_goal

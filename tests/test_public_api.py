@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 import mgpo_jax
-from envs.base import ArraySpec, Box, Discrete, EnvSpec
 from envs.errors import DataError, UsageError
+from envs.specs import ArraySpec, Box, Discrete, EnvSpec
 from mgpo_jax import Actor, Dataset, LoadedPolicy, TrainConfig, load_policy, pretrain, save_policy
 from mgpo_jax.dataset import BatchPlan
 from mgpo_jax.policy_files import read_policy

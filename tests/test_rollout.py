@@ -11,7 +11,7 @@ import pytest
 from scipy import special, stats
 
 import envs.episodes
-from envs.base import Agent
+from envs.agents import Agent
 from envs.episodes import run_episode
 from envs.maze.env import EAST, NORTH, STAY, WEST, MazeRunner, MazeTask
 from envs.wrappers import Wrapper

@@ -10,12 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs.base import ArraySpec, Box, Engine, Environment, EnvSpec, TimeStep
+from envs.base import Environment, TimeStep
 from envs.episodes import replay
 from envs.errors import DataError, NotAvailableError, UsageError
 from envs.gridworld.env import GridWorld
 from envs.maze.env import MazeRunner
 from envs.registry import Judgement
+from envs.specs import ArraySpec, Box, Engine, EnvSpec
 from envs.wrappers import Noisy, Wrapper
 from mgpo_jax import judging, lanes, runner
 from mgpo_jax.adaptation import Adapter

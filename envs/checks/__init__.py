@@ -15,7 +15,8 @@ from typing import Any
 import jax
 
 import envs.registry
-from envs.base import Demonstrator, Environment
+from envs.agents import Demonstrator
+from envs.base import Environment
 from envs.checks import rules
 from envs.checks.definitions import draw, record_faults, shape_faults, task_faults, trace_faults
 from envs.checks.episodes import run_case

@@ -12,9 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.base import Box, Discrete, Environment, EnvSpec, Task, TimeStep
+from envs.base import Environment, Task, TimeStep
 from envs.checks.values import equal, first_of, reason
 from envs.errors import NotAvailableError, shown
+from envs.specs import Box, Discrete, EnvSpec
 
 
 def record_faults(env: Any) -> Iterator[str]:

@@ -12,9 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
-from envs.base import Demonstrator, Environment, EnvSpec, Task
+from envs.agents import Demonstrator
+from envs.base import Environment, Task
 from envs.checks.values import all_equal, as_numpy
 from envs.episodes import run_episode
+from envs.specs import EnvSpec
 
 LANES = 6
 """Number of episodes that are run."""

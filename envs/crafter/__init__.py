@@ -13,10 +13,11 @@ if TYPE_CHECKING:
     from flax.linen import Module
     from jaxtyping import Array
 
-    from envs.base import Demonstrator, ObsLayout
+    from envs.agents import Demonstrator
     from envs.crafter.env import Crafter
     from envs.drawing import Pictures
     from envs.page import Page
+    from envs.specs import ObsLayout
 
 __all__ = [
     "CRAFTER",

@@ -18,7 +18,8 @@ import jax.numpy as jnp
 from craftax.craftax_classic.constants import Action, BlockType
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 
-from envs.base import Agent, Demonstrator, TimeStep
+from envs.agents import Agent, Demonstrator
+from envs.base import TimeStep
 from envs.crafter.env import Crafter, CrafterState, CrafterTask
 from envs.crafter.habits import Habits, Plan, make_plan
 from envs.crafter.planning import act

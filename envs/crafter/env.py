@@ -26,7 +26,7 @@ from craftax.craftax_classic.constants import Achievement
 from craftax.craftax_classic.envs.craftax_state import EnvState
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 
-from envs.base import ArraySpec, Discrete, Engine, Environment, EnvSpec, TimeStep
+from envs.base import Environment, TimeStep
 from envs.crafter.habits import TIERS
 from envs.crafter.rules import SIDE, advance, new_world
 from envs.crafter.tiles import PIXELS, agent_picture
@@ -40,6 +40,7 @@ from envs.crafter.view import (
     observe,
 )
 from envs.errors import UsageError
+from envs.specs import ArraySpec, Discrete, Engine, EnvSpec
 
 HEALTH_REWARD = 0.1
 PLACE_UNIT = 8.0  # cells

@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from envs.base import Agent
+from envs.agents import Agent
 from envs.crafter.env import Crafter, CrafterState, CrafterTask
 from envs.crafter.official import import_crafter
 from envs.crafter.rules import new_world

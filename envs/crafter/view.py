@@ -14,8 +14,8 @@ from craftax.craftax_classic.constants import Achievement, Action, BlockType
 from craftax.craftax_classic.envs.craftax_state import EnvState, Mobs
 from jaxtyping import Array, Float, Int
 
-from envs.base import ObsLayout
 from envs.crafter.rules import SIDE
+from envs.specs import ObsLayout
 
 ACTIONS = tuple(action.name.lower() for action in Action)
 ACHIEVEMENTS = tuple(achievement.name.lower() for achievement in Achievement)

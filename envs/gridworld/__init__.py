@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from envs.registry import Judgement, World
 
 if TYPE_CHECKING:
-    from envs.base import Demonstrator
+    from envs.agents import Demonstrator
     from envs.drawing import Pictures
     from envs.gridworld.env import GridWorld
     from envs.page import Page

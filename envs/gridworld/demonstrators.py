@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from envs.base import Agent, Demonstrator, TimeStep, Trajectory
+from envs.agents import Agent, Demonstrator
+from envs.base import TimeStep, Trajectory
 from envs.gridworld.env import (
     EAST,
     FLIP,

@@ -18,7 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from envs.base import ArraySpec, Discrete, Environment, EnvSpec, TimeStep
+from envs.base import Environment, TimeStep
+from envs.specs import ArraySpec, Discrete, EnvSpec
 
 WEST, NORTH, EAST, SOUTH, STAY, FLIP = range(6)
 MOVES = ((0, -1), (-1, 0), (0, 1), (1, 0), (0, 0), (0, 0))

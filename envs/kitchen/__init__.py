@@ -15,7 +15,7 @@ from envs.kitchen.extra import NoOpenGLError, check_extra, import_mujoco
 from envs.registry import World
 
 if TYPE_CHECKING:
-    from envs.base import Demonstrator
+    from envs.agents import Demonstrator
     from envs.drawing import Pictures
     from envs.kitchen.env import Kitchen
     from envs.official import Official

@@ -22,7 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from envs.base import Agent, Demonstrator, Episode, Task, TimeStep, Trajectory
+from envs.agents import Agent, Demonstrator
+from envs.base import Episode, Task, TimeStep, Trajectory
 from envs.kitchen.arm import Arm, Pose, arm_pose, make_arm, rotation_vector, turn
 from envs.kitchen.env import (
     NUM_SUBTASKS,

@@ -24,9 +24,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from envs.base import ArraySpec, Box, Engine, Environment, EnvSpec, State, Task, TimeStep
+from envs.base import Environment, State, Task, TimeStep
 from envs.kitchen.engines import BACKENDS, load_physics, resolve_backend
 from envs.kitchen.physics import MODELS, NUM_ROBOT, Physics
+from envs.specs import ArraySpec, Box, Engine, EnvSpec
 
 SUBTASKS = ("bottom burner", "light switch", "slide cabinet", "hinge cabinet", "microwave")
 NUM_SUBTASKS = len(SUBTASKS)

@@ -20,7 +20,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from envs.base import Agent, Demonstrator, Episode, TimeStep, Trajectory
+from envs.agents import Agent, Demonstrator
+from envs.base import Episode, TimeStep, Trajectory
 from envs.maze.bitboard import distances, toward
 from envs.maze.env import (
     GOAL_REWARD,

@@ -16,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from envs.base import ArraySpec, Discrete, Environment, EnvSpec, TimeStep
+from envs.base import Environment, TimeStep
 from envs.maze.bitboard import distances
+from envs.specs import ArraySpec, Discrete, EnvSpec
 
 WEST, NORTH, EAST, SOUTH, STAY = range(5)
 MOVES = ((0, -1), (-1, 0), (0, 1), (1, 0), (0, 0))

@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from pydantic import ValidationError
 
-from envs.base import EnvSpec, Episode, Trajectory
+from envs.base import Episode, Trajectory
 from envs.errors import DataError, UsageError
+from envs.specs import EnvSpec
 from experiments.store.layout import CONFIG
 from experiments.store.results import Results
 from mgpo_jax.adaptation import Adapter

@@ -15,9 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.base import EnvSpec, Episode
+from envs.base import Episode
 from envs.episodes import replay
 from envs.errors import DataError
+from envs.specs import EnvSpec
 from experiments.pages.knowledge import (
     blank_episode,
     check_not_stopped,

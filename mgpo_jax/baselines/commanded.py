@@ -21,7 +21,8 @@ import numpy as np
 from annotated_types import Ge, Le, MaxLen
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Shaped
 
-from envs.base import Agent, Environment, Goals, Trajectory
+from envs.agents import Agent
+from envs.base import Environment, Goals, Trajectory
 from envs.registry import Judgement
 from mgpo_jax.baselines.hierarchy import LowLevel, hierarchical
 from mgpo_jax.distributions import Distribution

@@ -19,7 +19,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
 
-from envs.base import Agent, Episode
+from envs.agents import Agent
+from envs.base import Episode
 from envs.errors import UsageError
 from mgpo_jax.adaptation import Adapter
 from mgpo_jax.baselines.methods import FinetuneHyper, PpoHyper, ReinforceHyper

@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from envs.base import Agent, Episode, State, Task, TimeStep, keeps_its_size
+from envs.agents import Agent, keeps_its_size
+from envs.base import Episode, State, Task, TimeStep
 from mgpo_jax.adaptation import Adapter
 
 

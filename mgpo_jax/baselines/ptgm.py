@@ -23,7 +23,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from envs.base import Agent, Episode, State
+from envs.agents import Agent
+from envs.base import Episode, State
 from envs.errors import UsageError
 from mgpo_jax.adaptation import Adapter
 from mgpo_jax.baselines.commanded import (

@@ -25,7 +25,8 @@ import jax.numpy as jnp
 from annotated_types import Ge, Le
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Shaped
 
-from envs.base import Agent, Trajectory
+from envs.agents import Agent
+from envs.base import Trajectory
 from envs.registry import Judgement
 from mgpo_jax.baselines.hierarchy import LowLevel, Mlp, hierarchical
 from mgpo_jax.distributions import HEADS, Distribution

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from envs.base import Agent, Episode
+from envs.agents import Agent
+from envs.base import Episode
 from envs.errors import UsageError
 from envs.registry import Judgement
 from mgpo_jax.adaptation import Adapter

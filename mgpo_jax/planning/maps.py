@@ -29,8 +29,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from envs.base import EnvSpec, Episode, Goals
+from envs.base import Episode, Goals
 from envs.errors import NotAvailableError
+from envs.specs import EnvSpec
 from mgpo_jax.adaptation import in_turn
 from mgpo_jax.optimizers.arms import Arms, empty_arms, estimated_returns, no_goals
 from mgpo_jax.optimizers.base import PromptOptimizer, SearchSpace

@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from envs.base import Environment, EnvSpec, TimeStep
+from envs.base import Environment, TimeStep
+from envs.specs import EnvSpec
 from mgpo_jax.planning.table import FAR, UNKNOWN, Table
 from mgpo_jax.policy import Policy
 from mgpo_jax.prompts import Prompt

@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Shaped
 
-from envs.base import EnvSpec, Episode, Goals
+from envs.base import Episode, Goals
+from envs.specs import EnvSpec
 
 UNKNOWN = -1
 """Index of an unknown state: the result of an untried action, and the padding after the end of a path."""
