@@ -18,6 +18,7 @@ from envs.base import Episode, Trajectory
 from envs.drawing import Film, Pictures, spread_apart, video, write_films
 from envs.maze import pictures as maze
 from envs.maze.env import NORTH, MazeRunner, MazeTask
+from envs.maze.markers import bar_lanes, place_goals
 from experiments import figures
 from experiments.figures import offered, rollouts
 from mgpo_jax.distributions import Categorical
@@ -96,16 +97,16 @@ def luminance(color) -> float:
 @pytest.mark.parametrize("side", [15, 31])
 def test_every_cell_is_found_again_from_its_goal(side):
     cells = np.argwhere(np.ones((side, side)))
-    placed = maze.place_goals(cells.astype(np.float32) / np.float32(side), side)
+    placed = place_goals(cells.astype(np.float32) / np.float32(side), side)
     np.testing.assert_array_equal(placed.cells, cells)
     assert not placed.outside.any()
 
 
 def test_goals_beyond_any_edge_are_outside():
     goals = [[-0.2, 0.5], [0.5, 1.1], [1.0, 0.5], [0.5, np.nan], [np.inf, 0.5], [1e30, -1e30]]
-    assert maze.place_goals(np.array(goals), SIDE).outside.all()
+    assert place_goals(np.array(goals), SIDE).outside.all()
     # The nearest cell counts: half a cell beyond the center of an edge cell is still inside.
-    assert not maze.place_goals(np.array([[-0.4, 6.4]]) / SIDE, SIDE).outside.any()
+    assert not place_goals(np.array([[-0.4, 6.4]]) / SIDE, SIDE).outside.any()
 
 
 def test_goals_are_numbered_discs_in_their_cells():
@@ -143,7 +144,7 @@ def test_a_crowded_bar_gets_more_lanes():
     goals = np.full((12, 2), 2.0)
     _, discs = drawn(prompt_goals=goals)
     assert len({(row, column) for _, row, column, _ in discs}) == 12
-    assert maze.bar_lanes(SIDE, [goals]) == 3
+    assert bar_lanes(SIDE, [goals]) == 3
     assert all(-0.5 < row < SIDE - 0.5 for _, row, _, _ in discs)
 
 

@@ -1,8 +1,6 @@
 """Pictures of mazes: walls, visits, paths, prompts, and GIFs of episodes.
 
-Positions are (row, column). Markers and labels are drawn in units of cells, so that they keep their places
-and proportions at every figure size. In large mazes, whose cells are too small for numbers, the goals of a
-prompt are dots.
+Positions are (row, column). What is drawn of a prompt are the markers of ``envs.maze.markers``.
 """
 
 from __future__ import annotations
@@ -10,50 +8,31 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, PowerNorm, to_rgb
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.patches import Circle
 from matplotlib.patheffects import Normal, Stroke
 
 from envs.base import Episode, Task
-from envs.drawing.marks import draw_box, draw_disc, draw_leader, spread_apart
-from envs.drawing.palette import (
-    BAR_COLOR,
-    BLUE,
-    FREE_COLOR,
-    ORANGE,
-    PAPER,
-    VERMILION,
-    WALL_COLOR,
-    YELLOW,
-)
+from envs.drawing.palette import BLUE, FREE_COLOR, ORANGE, VERMILION, WALL_COLOR
 from envs.drawing.pictures import Pictures, Shown
 from envs.drawing.video import axes_in_a_row, write_gif
 from envs.maze.bitboard import distances
 from envs.maze.env import MOVES, MazeRunner
-
-Cell = tuple[int, int] | np.ndarray  # row, column
+from envs.maze.markers import Cell, bar_lanes, draw_markers, marker_size, picture_width
 
 PROMPT_COLOR = VERMILION
 AGENT_COLOR = BLUE
 SHORTEST_COLOR = ORANGE
-START_COLOR = PAPER
-GOAL_COLOR = YELLOW
 SEEN_ON_DARK = (Stroke(linewidth=2.6, foreground="white"), Normal())
 VISIT_COLORS = LinearSegmentedColormap.from_list(
     "visits", ["#EAE6F3", "#C3B7DC", "#9A86C2", "#704FA3", "#48237F", "#260B4D"]
 )
-
-LARGEST_NUMBERED = 20  # side of the largest maze whose goals are drawn with their numbers
-DOT_RADIUS = 0.62  # of a goal in a larger maze, in cells
-
-BAR_GAP = 0.6  # distance in cells between the maze and the bar that shows goals outside of it
-BAR_LANE, BAR_ROW = 1.7, 1.35  # width and height of a marker's place in that bar, in marker units
 
 
 def maze_pictures(env: MazeRunner) -> Pictures:
@@ -152,15 +131,6 @@ def write_video(start: Cell, path: Path, task: Task, shown: Sequence[Shown]) -> 
     maze_gif(path, task.maze, start, task.goal, panels)
 
 
-class Placement(NamedTuple):
-    """The places of the goals of one prompt."""
-
-    cells: np.ndarray
-    """``[k, 2]`` integers, the nearest cells; meaningless for goals outside the maze."""
-    outside: np.ndarray
-    """``[k]`` booleans: whether the goal is outside of the maze."""
-
-
 class Panel(NamedTuple):
     """One episode of a GIF."""
 
@@ -169,15 +139,6 @@ class Panel(NamedTuple):
     """``[T + 1, 2]`` cells, beginning with the start."""
     prompt_goals: np.ndarray | None = None
     """``[k, 2]``: the goals of the prompt, in goal units."""
-
-
-class _Marker(NamedTuple):
-    """A labeled shape at a cell or (with ``cell=None``) in the bar."""
-
-    label: str
-    color: str
-    shape: Literal["disc", "box"]
-    cell: tuple[int, int] | None
 
 
 def walk_of(episode: Episode, side: int, start: Cell) -> np.ndarray:
@@ -217,15 +178,6 @@ def reached_counts(goals: np.ndarray, maze: np.ndarray) -> np.ndarray:
     return counts
 
 
-def place_goals(goals: np.ndarray, side: int) -> Placement:
-    """Cells of goals given in goal units (row / side, column / side)."""
-    positions = np.asarray(goals, np.float64).reshape(-1, 2) * side
-    finite = np.isfinite(positions)
-    # Values are clipped first, so that huge ones do not overflow integers.
-    cells = np.rint(np.clip(np.where(finite, positions, -1.0), -1.0, side)).astype(int)
-    return Placement(cells, ~np.all((cells >= 0) & (cells < side), axis=1))
-
-
 def visit_norm(*visits: np.ndarray) -> PowerNorm:
     """A color scale that several pictures can share, with more contrast among low counts."""
     top = max((float(np.max(counts)) for counts in visits), default=0.0)
@@ -235,17 +187,6 @@ def visit_norm(*visits: np.ndarray) -> PowerNorm:
 def visit_scale(norm: PowerNorm) -> ScalarMappable:
     """The argument of ``Figure.colorbar`` for the colors of visits."""
     return ScalarMappable(norm, VISIT_COLORS)
-
-
-def bar_lanes(side: int, prompts: Iterable[np.ndarray]) -> int:
-    """The number of lanes that the bar needs for goals of ``prompts`` outside of the maze."""
-    count = sum(int(place_goals(goals, side).outside.sum()) for goals in prompts)
-    return -(-count // _markers_in_lane(side))
-
-
-def picture_width(side: int, lanes: int) -> float:
-    """Width in cells of a maze with its bar."""
-    return side + (BAR_GAP + lanes * BAR_LANE * _unit(side) if lanes else 0.0)
 
 
 def draw_maze(
@@ -293,10 +234,7 @@ def draw_maze(
         ax.plot(
             columns, rows, color=SHORTEST_COLOR, linewidth=1.1, linestyle=(0, (2, 2)), zorder=1.2
         )
-    markers = _markers(side, start, goal, prompts)
-    if side > LARGEST_NUMBERED:
-        markers = _draw_dots(ax, markers, start, goal, joined=not paths)
-    _draw_markers(ax, side, markers, lanes)
+    draw_markers(ax, side, start, goal, prompts, lanes, joined=not paths)
 
     right = picture_width(side, lanes) - 0.5
     ax.set(xlim=(-0.5, right), ylim=(side - 0.5, -0.5), xticks=[], yticks=[], aspect="equal")
@@ -316,7 +254,7 @@ def maze_gif(
     for ax, panel in zip(axes, panels, strict=True):
         draw_maze(ax, maze, start, goal, panel.prompt_goals, lanes=lanes)
         (trail,) = ax.plot([], [], color=AGENT_COLOR, alpha=0.6, linewidth=2.5, zorder=1.5)
-        agent = Circle((0, 0), 0.36 * _unit(side), facecolor=AGENT_COLOR, edgecolor="white")
+        agent = Circle((0, 0), 0.36 * marker_size(side), facecolor=AGENT_COLOR, edgecolor="white")
         agent.set(zorder=9)
         ax.add_patch(agent)
         moving.append((panel.walk, trail, agent))
@@ -336,16 +274,6 @@ def _by_color(prompts: np.ndarray | Mapping[str, np.ndarray] | None) -> Mapping[
     return prompts if isinstance(prompts, Mapping) else {PROMPT_COLOR: np.asarray(prompts)}
 
 
-def _unit(side: int) -> float:
-    """The size of markers in cells: a little more than one cell, and larger in big mazes with small
-    cells."""
-    return max(1.0, side / 19)
-
-
-def _markers_in_lane(side: int) -> int:
-    return int(side / (BAR_ROW * _unit(side)))
-
-
 def _cell_colors(maze: np.ndarray, visits: np.ndarray | None, norm: PowerNorm | None) -> np.ndarray:
     colors = np.empty((*maze.shape, 3))
     colors[:] = to_rgb(FREE_COLOR)
@@ -355,72 +283,3 @@ def _cell_colors(maze: np.ndarray, visits: np.ndarray | None, norm: PowerNorm | 
         colors[visited] = VISIT_COLORS(norm(visits[visited]))[:, :3]
     colors[maze != 0] = to_rgb(WALL_COLOR)
     return colors
-
-
-def _markers(
-    side: int, start: Cell, goal: Cell, prompts: Mapping[str, np.ndarray]
-) -> list[_Marker]:
-    def as_cell(cell: Cell) -> tuple[int, int]:
-        return (int(cell[0]), int(cell[1]))
-
-    markers = [
-        _Marker("S", START_COLOR, "box", as_cell(start)),
-        _Marker("T", GOAL_COLOR, "box", as_cell(goal)),
-    ]
-    for color, goals in prompts.items():
-        cells, outside = place_goals(goals, side)
-        for index, (cell, is_outside) in enumerate(zip(cells, outside, strict=True)):
-            is_last = index == len(cells) - 1
-            if not is_outside and is_last and as_cell(cell) == as_cell(goal):
-                continue
-            at = None if is_outside else as_cell(cell)
-            markers.append(_Marker(str(index + 1), color, "disc", at))
-    return markers
-
-
-def _draw_dots(
-    ax: Axes, markers: list[_Marker], start: Cell, goal: Cell, joined: bool
-) -> list[_Marker]:
-    """Draw the goals inside of the maze as dots below paths, and return the other markers.
-
-    If they are ``joined``, a thin line leads from the start over the goals of each prompt to its last one.
-    """
-    dots = [marker for marker in markers if marker.shape == "disc" and marker.cell is not None]
-    for marker in dots:
-        row, column = marker.cell or (0, 0)
-        dot = Circle((column, row), DOT_RADIUS, facecolor=marker.color, edgecolor=PAPER)
-        dot.set(linewidth=0.6, zorder=0.8)
-        ax.add_patch(dot)
-    for color in dict.fromkeys(marker.color for marker in dots if joined):
-        way = [start, *(dot.cell for dot in dots if dot.color == color and dot.cell), goal]
-        rows, columns = np.asarray(way, float).T
-        ax.plot(columns, rows, color=color, linewidth=0.9, zorder=0.7)
-    return [marker for marker in markers if marker not in dots]
-
-
-def _draw_markers(ax: Axes, side: int, markers: list[_Marker], lanes: int) -> None:
-    unit = _unit(side)
-    inside = [marker for marker in markers if marker.cell is not None]
-    homes = np.array([marker.cell for marker in inside], float)
-    heavy = np.array([marker.shape == "box" for marker in inside])
-    margin = 0.6 * unit - 0.5  # so that no marker is cut off at the edge
-    centers = spread_apart(homes, heavy, gap=unit, limits=(margin, side - 1 - margin))
-    for marker, home, center in zip(inside, homes, centers, strict=True):
-        if np.linalg.norm(center - home) > 0.5:
-            draw_leader(ax, home, center)
-        _draw_marker(ax, marker, center[1], center[0], unit)
-
-    outside = [marker for marker in markers if marker.cell is None]
-    if outside:
-        left, width = side - 0.5 + BAR_GAP, lanes * BAR_LANE * unit
-        height = (min(len(outside), _markers_in_lane(side)) + 0.2) * BAR_ROW * unit
-        ax.add_patch(Rectangle((left, -0.5), width, height, facecolor=BAR_COLOR, linewidth=0))
-        for index, marker in enumerate(outside):
-            lane, row = divmod(index, _markers_in_lane(side))
-            x = left + (lane + 0.5) * BAR_LANE * unit
-            _draw_marker(ax, marker, x, -0.5 + (row + 0.6) * BAR_ROW * unit, unit)
-
-
-def _draw_marker(ax: Axes, marker: _Marker, x: float, y: float, size: float) -> None:
-    draw = draw_disc if marker.shape == "disc" else draw_box
-    draw(ax, marker.label, marker.color, x, y, size)
