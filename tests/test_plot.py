@@ -201,6 +201,15 @@ def test_goals_in_a_large_maze_are_dots_below_paths(paths):
     assert {"S", "T", "2"} <= {patch.get_label() for patch in ax.patches}
 
 
+def test_the_line_of_a_prompt_ends_at_its_last_goal():
+    """Which a prompt given by hand need not have at T."""
+    side, goals = 31, np.array([[27, 15], [5, 7]])
+    ax = Figure().add_subplot()
+    maze.draw_maze(ax, np.zeros((side, side)), (29, 15), (1, 1), goals / side)
+    (line,) = ax.lines
+    np.testing.assert_array_equal(line.get_ydata(), [29, 27, 5])
+
+
 def test_a_bar_without_goals_is_only_room():
     ax, _ = drawn(prompt_goals=np.array([[3, 1]]) / SIDE, lanes=1)
     assert not any(type(patch) is Rectangle for patch in ax.patches)

@@ -95,7 +95,7 @@ def draw_markers(
     """
     markers = _markers(side, start, goal, prompts)
     if side > LARGEST_NUMBERED:
-        markers = _draw_dots(ax, markers, start, goal, joined)
+        markers = _draw_dots(ax, markers, start, side, prompts if joined else {})
     _draw_labeled(ax, side, markers, lanes)
 
 
@@ -125,11 +125,11 @@ def _markers(
 
 
 def _draw_dots(
-    ax: Axes, markers: list[_Marker], start: Cell, goal: Cell, joined: bool
+    ax: Axes, markers: list[_Marker], start: Cell, side: int, joined: Mapping[str, np.ndarray]
 ) -> list[_Marker]:
     """Draw the goals inside of the maze as dots below paths, and return the other markers.
 
-    If they are ``joined``, a thin line leads from the start over the goals of each prompt to its last one.
+    A thin line leads from the start over the goals of each prompt of ``joined`` that has dots.
     """
     dots = [marker for marker in markers if marker.shape == "disc" and marker.cell is not None]
     for marker in dots:
@@ -137,9 +137,9 @@ def _draw_dots(
         dot = Circle((column, row), DOT_RADIUS, facecolor=marker.color, edgecolor=PAPER)
         dot.set(linewidth=0.6, zorder=0.8)
         ax.add_patch(dot)
-    for color in dict.fromkeys(marker.color for marker in dots if joined):
-        way = [start, *(dot.cell for dot in dots if dot.color == color and dot.cell), goal]
-        rows, columns = np.asarray(way, float).T
+    for color in dict.fromkeys(dot.color for dot in dots if dot.color in joined):
+        cells, outside = place_goals(joined[color], side)
+        rows, columns = np.asarray([start, *cells[~outside]], float).T
         ax.plot(columns, rows, color=color, linewidth=0.9, zorder=0.7)
     return [marker for marker in markers if marker not in dots]
 
