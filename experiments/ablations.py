@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 import envs
 from envs.errors import NotAvailableError, nearest
 from experiments.adaptation import adapt_all, deciding, finished, save_outcome
-from experiments.comparisons import PUBLISHED, gap, published
+from experiments.comparison_tables import gap
+from experiments.comparisons import PUBLISHED, published
 from experiments.drawing import write
 from experiments.figures import later, learning_curve
 from experiments.signals import GO_ON, farewell, kept

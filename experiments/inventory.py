@@ -12,7 +12,6 @@ import envs
 from envs.errors import DataError, UsageError
 from experiments import ablations, glance, robustness
 from experiments.comparisons import (
-    PICTURES,
     SMOKE_TASKS,
     Cell,
     cell_config,
@@ -21,6 +20,7 @@ from experiments.comparisons import (
     published,
     worlds_of,
 )
+from experiments.paper_figures import PICTURES
 from experiments.store import runs
 from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.metrics import METRICS, cpu_seconds_of_training, read_metrics

@@ -67,7 +67,7 @@ def make(config: ReproduceConfig) -> None:
 
         glance.draw(config)  # prints the file that it writes
     elif config.what in PICTURES:
-        from experiments.comparisons import draw
+        from experiments.paper_figures import draw
 
         draw(config)
     else:
@@ -81,16 +81,16 @@ def make_comparison(config: ReproduceConfig) -> None:
       DataError: at the end, if the adaptation of a cell failed.
     """
     join(config)
-    from experiments import comparisons, robustness
+    from experiments import comparison_tables, comparisons, robustness
 
     comparisons.share_out(config)
     if not processes.is_first():
         return
     behind_noise = config.what == "table3"
     with processes.apart():  # all cells are made now, and process 0 alone makes the table
-        made = robustness.compare(config) if behind_noise else comparisons.compare(config)
+        made = robustness.compare(config) if behind_noise else comparison_tables.compare(config)
     say(made.text)
-    place = comparisons.files_of(config)[0]
+    place = comparison_tables.files_of(config)[0]
     text = f"table in {place}" if behind_noise else f"table and curves in {place} and .png"
     print(text, file=sys.stderr)
     if made.failed:

@@ -18,13 +18,10 @@ from annotated_types import Ge
 from pydantic import BaseModel, Field
 
 from envs.errors import DataError, UsageError
+from experiments.comparison_tables import Compared, Notes, files_of, gap
 from experiments.comparisons import (
     PUBLISHED,
     Cell,
-    Compared,
-    Notes,
-    files_of,
-    gap,
     made,
     methods_of,
     num_seeds,

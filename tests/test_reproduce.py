@@ -15,7 +15,15 @@ import pytest
 import envs
 from envs import episodes
 from envs.errors import DataError, NotAvailableError, UsageError
-from experiments import ablations, comparisons, inventory, reproduce, robustness
+from experiments import (
+    ablations,
+    comparison_tables,
+    comparisons,
+    inventory,
+    paper_figures,
+    reproduce,
+    robustness,
+)
 from experiments.reproduce import main
 from experiments.store import reproduce_settings, speeds
 from experiments.store.paper import paper_worlds
@@ -146,7 +154,8 @@ def test_table1_from_cells_to_table(
     """``reproduce table1 --scale smoke`` with two tasks and two episodes, and then once more."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(comparisons, "SMOKE_TASKS", 2)
-    monkeypatch.setattr(comparisons, "SMOKE_EPISODES", 2)
+    for module in (comparisons, comparison_tables):
+        monkeypatch.setattr(module, "SMOKE_EPISODES", 2)
     monkeypatch.setattr(episodes, "MAX_SEGMENTS", 1)
     load = comparisons.load_policy
 
@@ -175,7 +184,7 @@ def test_table1_from_cells_to_table(
     assert ptgm[2:] == ["-0.96 ± 0.08", *["-"] * 5]
     assert "- maze15: no policy in that folder" in text
     assert "Scaled down: 2 tasks, 1 seed, 2 episodes" in text
-    assert comparisons.files_of(config)[1].stat().st_size > 0
+    assert comparison_tables.files_of(config)[1].stat().st_size > 0
     (row,) = [line for line in inventory.inventory(config).splitlines() if "| table1 |" in line]
     assert row.startswith("| table1 | maze15 | 2 of 3 | 0.0 | ")
 
@@ -216,7 +225,7 @@ def test_a_published_cell_of_fewer_seeds_stands_until_there_is_one_of_all(
     assert cell.results == Path("results/maze30/ppo")
     assert (
         "- maze30, BC-finetune (PPO): 1 seed(s), where the paper has 3.\n"
-        in comparisons.as_table([cell])
+        in comparison_tables.as_table([cell])
     )
     with_all = comparisons.cell_config(config, "maze30", "ppo").folder
     shutil.copytree("results/maze30/ppo", with_all)
@@ -244,7 +253,7 @@ def test_a_cell_that_fails_is_a_dash_and_the_others_are_made(
     with pytest.raises(
         DataError, match=r"figure2 is not available for maze15: .* failed: a return"
     ):
-        comparisons.draw(replace(config, what="figure2"))
+        paper_figures.draw(replace(config, what="figure2"))
 
 
 def test_figures_are_drawn_of_published_results(
@@ -255,13 +264,13 @@ def test_figures_are_drawn_of_published_results(
 
     monkeypatch.setattr(comparisons, "adapt_and_save", never)
     config = ReproduceConfig(what="figure2", out=tmp_path)
-    (drawn,) = comparisons.draw(config)
+    (drawn,) = paper_figures.draw(config)
     assert drawn == tmp_path / "figure2-cpu_maze15_prompts.png"
     assert drawn.stat().st_size > 0
     absent = comparisons.Cell("crafter", "ucb", None, "no network is released")
-    monkeypatch.setattr(comparisons, "made", lambda *_: absent)
+    monkeypatch.setattr(paper_figures, "made", lambda *_: absent)
     with pytest.raises(UsageError, match="figure2 is not available for crafter: no network is"):
-        comparisons.draw(replace(config, env=("crafter",)))
+        paper_figures.draw(replace(config, env=("crafter",)))
 
 
 def test_every_method_of_a_comparison_is_known() -> None:
@@ -322,7 +331,7 @@ def test_budgets_are_those_of_the_worlds_preset() -> None:
 def test_cells_of_table1_have_the_units_of_their_columns() -> None:
     folder = Path("results/maze15/ucb").absolute()
     summary = read_summary(folder)
-    text = comparisons.as_table([comparisons.Cell("maze15", "ucb", folder)])
+    text = comparison_tables.as_table([comparisons.Cell("maze15", "ucb", folder)])
     head, _, row = (
         [cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()[:3]
     )
@@ -332,7 +341,7 @@ def test_cells_of_table1_have_the_units_of_their_columns() -> None:
     assert best == pytest.approx(summary["best_episode_return"], abs=0.0051)
     assert best > summary["final_return"]
     assert "fresh" not in text
-    text = comparisons.as_table(
+    text = comparison_tables.as_table(
         [
             comparisons.Cell(
                 "crafter-symbolic", "bpe", folder.parents[1] / "crafter-symbolic" / "bpe"
