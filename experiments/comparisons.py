@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -219,17 +219,18 @@ def cells(config: ReproduceConfig) -> Iterator[Cell]:
             yield made(config, world, method)
 
 
-def share_out(config: ReproduceConfig) -> None:
+def share_out(config: ReproduceConfig, make: Callable[[ReproduceConfig, str, str], object]) -> None:
     """Distribute the missing cells of a comparison over the processes, each of which makes its share.
 
     The processes need a shared folder. Cells that start from the same trained network go to the same
-    process, which also measures the rows of a cell for Table 3. A single process does nothing here: it
-    makes the cells when the table requests them.
+    process. A single process does nothing here: it makes the cells when the table requests them.
+
+    Args:
+      config: settings of the command.
+      make: called with a world and a method; makes their cell and whatever else a table needs of it.
     """
     if processes.count() == 1:
         return
-    from experiments import robustness  # which is made of this module
-
     groups: dict[Any, list[tuple[str, str]]] = {}
     for world in worlds_of(config):
         for method in methods_of(config):
@@ -239,8 +240,5 @@ def share_out(config: ReproduceConfig) -> None:
     own = list(groups.values())[processes.index() :: processes.count()]
     with processes.apart():
         for world, method in itertools.chain.from_iterable(own):
-            if config.what == "table3":
-                list(robustness.rows_of(config, world, method))  # makes the cell, and its rows
-            else:
-                made(config, world, method)
+            make(config, world, method)
     processes.exchange(b"")

@@ -83,10 +83,10 @@ def make_comparison(config: ReproduceConfig) -> None:
     join(config)
     from experiments import comparison_tables, comparisons, robustness
 
-    comparisons.share_out(config)
+    behind_noise = config.what == "table3"
+    comparisons.share_out(config, robustness.rows_of if behind_noise else comparisons.made)
     if not processes.is_first():
         return
-    behind_noise = config.what == "table3"
     with processes.apart():  # all cells are made now, and process 0 alone makes the table
         made = robustness.compare(config) if behind_noise else comparison_tables.compare(config)
     say(made.text)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -161,13 +161,12 @@ def _rows_in(folder: Path) -> tuple[Behind, ...]:
     return tuple(found)
 
 
-def rows_of(config: ReproduceConfig, world: str, method: str) -> Iterator[Row]:
+def rows_of(config: ReproduceConfig, world: str, method: str) -> list[Row]:
     """All rows of a method in a world; missing ones are measured."""
     cell = made(config, world, method)
     sizes = sizes_of(config)
     if cell.results is None:
-        yield from (Row(world, method, noise, None, cell.reason, cell.failed) for noise in sizes)
-        return
+        return [Row(world, method, noise, None, cell.reason, cell.failed) for noise in sizes]
     rows = {noise: Row(world, method, noise, known(config, cell, noise)) for noise in sizes}
     cases = {}
     for noise, row in rows.items():
@@ -184,7 +183,7 @@ def rows_of(config: ReproduceConfig, world: str, method: str) -> Iterator[Row]:
             _keep(place_of_row(config, cell, noise), values)
             rows[noise] = rows[noise]._replace(found=known(config, cell, noise))
             spent = time.process_time()
-    yield from rows.values()
+    return list(rows.values())
 
 
 def num_episodes(config: ReproduceConfig) -> int:

@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 from envs.errors import DataError, UsageError
-from experiments import comparisons, robustness
+from experiments import comparisons, reproduce, robustness
+from experiments.comparison_tables import Compared
 from experiments.comparisons import Cell
 from experiments.evaluation import Noise
 from experiments.robustness import Behind, Row
@@ -100,22 +101,30 @@ def test_missing_rows_are_measured_once(unpublished: list[Noise], tmp_path: Path
 def test_processes_share_the_measurements(
     index: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each measures the rows of its cells, as if it were alone."""
+    """Each measures the rows of its cells, as if it were alone, and process 0 makes the table."""
     measured: list[tuple[str, str, int]] = []
+    tables: list[int] = []
 
-    def rows_of(config: ReproduceConfig, world: str, method: str) -> Iterator[Row]:
+    def rows_of(config: ReproduceConfig, world: str, method: str) -> list[Row]:
         measured.append((world, method, processes.count()))
-        yield Row(world, method, Noise(), None)
+        return [Row(world, method, Noise(), None)]
+
+    def compare(config: ReproduceConfig) -> Compared:
+        tables.append(processes.count())
+        return Compared("", [])
 
     monkeypatch.setattr(robustness, "rows_of", rows_of)
+    monkeypatch.setattr(robustness, "compare", compare)
+    monkeypatch.setattr(reproduce, "join", lambda config: None)
     members = [processes.Member(number, "here", number) for number in range(2)]
     team = processes.Team(members, index, {}, lambda *_: None)
     monkeypatch.setattr(team, "combine", lambda piece, make: b"")
     monkeypatch.setattr(processes._present, "team", team)
     config = replace(CONFIG, out=tmp_path, env=("kitchen", "grid"), only=("ucb", "bpe"))
-    comparisons.share_out(config)
+    reproduce.make_comparison(config)
     worlds, chosen = comparisons.worlds_of(config), comparisons.methods_of(config)
     assert measured == [(w, m, 1) for w in worlds for m in chosen][index::2]
+    assert tables == [1][index:]
 
 
 def test_the_cost_of_a_row_is_in_minutes() -> None:
