@@ -13,7 +13,8 @@ from conftest import require_kitchen
 
 import envs
 from envs.kitchen.env import Kitchen
-from experiments import datasets
+from experiments import demonstrations
+from experiments.datasets import collect
 from mgpo_jax.lanes import together
 from mgpo_jax.tasks import benchmark_tasks, evaluation_tasks, task_hashes
 
@@ -162,7 +163,7 @@ def test_tasks_are_those_of_the_kitchen():
 
 def test_a_dataset_keeps_the_scene_of_each_trajectory(monkeypatch):
     """Single subtasks in a short kitchen; whatever they are worth is kept."""
-    monkeypatch.setattr(datasets, "BATCH", 8)
+    monkeypatch.setattr(demonstrations, "BATCH", 8)
     env = replace(SCENES["reduced"], horizon=6)
     expert = envs.find("kitchen").demonstrators(env)["expert"]
     place = replace(expert.env, stock_share=0.5)
@@ -171,7 +172,7 @@ def test_a_dataset_keeps_the_scene_of_each_trajectory(monkeypatch):
         sample_task=lambda key, index: place.varied(key, env.task(index % 5)),
         keeps=lambda episode: episode.trajectory.length > 0,
     )
-    dataset, facts = datasets.collect(env, expert, num=8, seed=0, num_test_tasks=25)
+    dataset, facts = collect(env, expert, num=8, seed=0, num_test_tasks=25)
     assert list(facts["variants"]) == list(MODELS)
     assert sum(facts["variants"].values()) == len(dataset) == 8
     assert len(set(dataset.variants.tolist())) == 2

@@ -23,7 +23,7 @@ from test_training import CONFIG, DATASET, NETWORK, WHOLE, parts_of
 
 from envs.errors import UsageError
 from experiments import cards, joining, signals, training
-from experiments.datasets import _as_one
+from experiments.demonstrations import _as_one
 from experiments.joining import Joined, check_flags
 from mgpo_jax import doors, lanes, processes, programs, segments, sharding
 from mgpo_jax.checkpoint import Snapshot

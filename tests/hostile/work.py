@@ -33,7 +33,7 @@ class Evaluation:
 EVALUATION = ("experiments.watching", "ReturnsOnTheWay", Evaluation)
 PLACES: tuple[tuple[str, str, Any], ...] = (
     ("experiments.runtime", "configure", lambda: None),
-    ("experiments.datasets", "program_of", begin),
+    ("experiments.demonstrations", "program_of", begin),
     EVALUATION,
     ("mgpo_jax.training", "Trainer.step", begin),
     ("mgpo_jax.runner", "lay_out", begin),
