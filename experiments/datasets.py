@@ -79,7 +79,7 @@ def collected(
       Facts about the dataset; None in processes other than 0.
 
     Raises:
-      DataError: if the demonstrator fails ``demonstrations.MAX_TRIES`` times at one task.
+      DataError: if the demonstrator fails too often at one task, or nothing can be kept.
     """
     attempts, journal = Attempts(env.spec.name), journal or Journal()
     forbidden = task_hashes(env, benchmark_tasks(env, num_test_tasks))
