@@ -1,6 +1,6 @@
 """The static specification of a world: its observations, goals and actions, and what its engine requires.
 
-Specifications are hashable, so that compiled programs are shared by worlds with equal ones.
+All of it is static configuration: frozen, hashable, and never traced.
 """
 
 from __future__ import annotations
