@@ -24,7 +24,7 @@ from envs.base import Episode
 from envs.errors import UsageError
 from mgpo_jax.adaptation import Adapter
 from mgpo_jax.baselines.methods import FinetuneHyper, PpoHyper, ReinforceHyper
-from mgpo_jax.baselines.returns import advantages, returns_to_go
+from mgpo_jax.baselines.returns import estimates, ppo_loss, real_mean, returns_to_go
 from mgpo_jax.baselines.subsets import Subset, subset
 from mgpo_jax.distributions import Distribution
 from mgpo_jax.methods import Setting
@@ -106,11 +106,6 @@ class Round(NamedTuple):
     """Number of rounds at the start in which only the value head is trained."""
     value_rate: Float[Array, ""] | float = 0.0
     max_kl: Float[Array, ""] | float | None = None
-
-
-def real_mean(values: Float[Array, "K T"], real: Bool[Array, "K T"]) -> Float[Array, ""]:
-    """Mean over the real steps."""
-    return jnp.sum(jnp.where(real, values, 0.0)) / jnp.maximum(real.sum(), 1)
 
 
 def optimizer(
@@ -298,22 +293,14 @@ def make_ppo(setting: Setting, params: Any, hyper: PpoHyper) -> Adapter:
     """
 
     def loss_of(batch: Batch) -> Loss:
-        estimate = jax.vmap(advantages, (0, 0, 0, None, None))
-        gains = estimate(batch.rewards, batch.values, batch.real, hyper.discount, hyper.gae_lambda)
-        targets = jax.lax.stop_gradient(gains + batch.values)
-        mean = real_mean(gains, batch.real)
-        spread = jnp.sqrt(real_mean((gains - mean) ** 2, batch.real))
-        gains = jax.lax.stop_gradient((gains - mean) / (spread + 1e-8))
+        values, discount = batch.values, hyper.discount
+        known = estimates(batch.rewards, values, batch.real, discount, hyper.gae_lambda)
         old = jax.lax.stop_gradient(batch.before.log_prob_of_sample(batch.actions))
 
         def loss(now: Pass, batch: Batch) -> Array:
             log_ratio = now.actions.log_prob_of_sample(batch.actions) - old
-            ratio = jnp.exp(jnp.where(batch.real, log_ratio, 0.0))
-            clipped = jnp.clip(ratio, 1 - hyper.clip, 1 + hyper.clip)
-            gained = jnp.minimum(ratio * gains, clipped * gains)
-            missed = (now.values - targets) ** 2
-            return -real_mean(gained, batch.real) + hyper.value_weight * real_mean(
-                missed, batch.real
+            return ppo_loss(
+                log_ratio, now.values, known, batch.real, hyper.clip, hyper.value_weight
             )
 
         return loss
