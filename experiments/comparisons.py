@@ -57,7 +57,8 @@ TABLES: Mapping[str, Comparison] = {
         title="Table 1: MGPO and other methods",
         methods=("gcbc", "ppo", "spirl", "ptgm", "ucb"),
         further=(
-            "ppo-careful", "spirl-prior", "ptgm-goal", "ptgm-random", "ptgm-prior", "ptgm-oracle",
+            "ppo-careful", "spirl-prior", "ptgm-goal", "ptgm-ppo", "ptgm-random", "ptgm-prior",
+            "ptgm-oracle",
         ),
     ),
     "table2": Comparison(

@@ -268,7 +268,7 @@ METHODS: Registry[Method] = Registry(
             name: f"mgpo_jax.baselines.methods:{name.upper().replace('-', '_')}"
             for name in (
                 "reinforce", "reinforce-careful", "ppo", "ppo-careful",
-                "ptgm", "ptgm-goal", "ptgm-random", "ptgm-prior", "ptgm-oracle",
+                "ptgm", "ptgm-goal", "ptgm-ppo", "ptgm-random", "ptgm-prior", "ptgm-oracle",
                 "spirl", "spirl-prior",
             )
         },

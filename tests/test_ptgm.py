@@ -38,7 +38,7 @@ from mgpo_jax.baselines.hierarchy import (
     transitions,
 )
 from mgpo_jax.baselines.methods import PtgmGoalHyper, PtgmHyper
-from mgpo_jax.baselines.ptgm import Choice, Kept, Ptgm, greedy_divergence, targets
+from mgpo_jax.baselines.ptgm import Choice, Kept, Ptgm, greedy_divergence, seen_by, targets
 from mgpo_jax.methods import Setting
 from mgpo_jax.network_configs import world_side
 from mgpo_jax.policy import LoadedPolicy
@@ -406,12 +406,11 @@ def test_it_explores_in_the_search_and_is_judged_without(params):
     assert adapter.best(state).epsilon == 0
 
 
-def test_the_high_level_sees_what_its_settings_say(params, view):
+def test_the_high_level_sees_what_its_settings_say(view):
     goal = jnp.arange(CONFIG.goal_dim, dtype=jnp.float32)
     for reads, part in (("observation", view.obs), ("history", view.features)):
         alone, beside = (
-            learner(PtgmHyper(reads=reads, sees_goal=sees), params)._seen(view, goal)
-            for sees in (False, True)
+            seen_by(PtgmHyper(reads=reads, sees_goal=sees), view, goal) for sees in (False, True)
         )
         np.testing.assert_array_equal(alone, part)
         np.testing.assert_array_equal(beside, [*part, *goal])

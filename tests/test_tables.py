@@ -149,7 +149,8 @@ def test_the_published_table_is_that_of_the_results(
     methods = (
         "plan", "ucb", "bpe", "explore", "grips", "bbt", "ucb-seed1", "ucb-seed2",
         "reinforce", "reinforce-careful", "ppo", "ppo-careful",
-        "ptgm", "ptgm-goal", "ptgm-random", "ptgm-prior", "ptgm-oracle", "spirl", "spirl-prior",
+        "ptgm", "ptgm-goal", "ptgm-ppo", "ptgm-random", "ptgm-prior", "ptgm-oracle",
+        "spirl", "spirl-prior",
     )  # fmt: skip
     folders = [Path("results", world, method) for world in worlds for method in methods]
     main(TableConfig(runs=tuple(folder for folder in folders if folder.exists())))

@@ -83,6 +83,7 @@ METHODS = {
         "spirl-prior": ("#B2ABD2", ":", "o"),
         "ptgm": ("#003C30", "--", "X"),
         "ptgm-goal": ("#35978F", "--", "P"),
+        "ptgm-ppo": ("#66C2A4", "--", "^"),
         "ptgm-random": ("#A6BDBB", ":", "X"),
         "ptgm-prior": ("#7FA8A3", ":", "s"),
         "ptgm-oracle": ("#01665E", ":", "D"),

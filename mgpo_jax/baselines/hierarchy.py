@@ -25,13 +25,23 @@ class Mlp(nn.Module):
     num_outputs: int
     width: int = 128
     depth: int = 3
+    starts_at_zero: bool = False
+    """Whether all outputs are 0 before the first update."""
 
     @nn.compact
     def __call__(self, x: Float[Array, "*batch I"]) -> Float[Array, "*batch O"]:
         for _ in range(self.depth):
             x = nn.relu(nn.Dense(self.width)(x))
-        found: Array = nn.Dense(self.num_outputs)(x)
+        last: Any = {"kernel_init": nn.initializers.zeros} if self.starts_at_zero else {}
+        found: Array = nn.Dense(self.num_outputs, **last)(x)
         return found
+
+
+class Choice(NamedTuple):
+    """How a high level that draws its decisions from a distribution makes those of an episode."""
+
+    greedy: Bool[Array, "*batch"]
+    """Whether it takes the mode of the distribution instead of a sample."""
 
 
 class LowLevel(NamedTuple):

@@ -59,8 +59,8 @@ class CarefulReinforceHyper(ReinforceHyper):
 
 
 @dataclass(frozen=True)
-class PpoHyper(FinetuneHyper):
-    """Hyper-parameters of PPO. Beyond Table 7 the paper gives none; the defaults are customary values."""
+class ClipHyper:
+    """Hyper-parameters of PPO's loss and of its estimates, with customary values."""
 
     clip: Positive = 0.2
     """Largest deviation from 1 of a probability ratio, which is clipped there."""
@@ -70,6 +70,13 @@ class PpoHyper(FinetuneHyper):
     """Lambda of generalized advantage estimation."""
     value_weight: NotNegative = 0.5
     """Weight of the value loss, the squared error of the values."""
+
+
+# The first base that is named has the last fields.
+@dataclass(frozen=True)
+class PpoHyper(ClipHyper, FinetuneHyper):
+    """Hyper-parameters of PPO. Beyond Table 7 the paper gives none; the defaults are customary values."""
+
     value_rate: Rate = 1e-4
     """Learning rate of the value head."""
     share_trunk: bool = static(True)
@@ -94,21 +101,15 @@ class CarefulPpoHyper(PpoHyper):
 
 
 @dataclass(frozen=True)
-class PtgmHyper:
-    """Hyper-parameters of PTGM's high level. Values in brackets are those of Table 10."""
+class HighLevelHyper:
+    """Hyper-parameters of every high level that chooses goals. Values in brackets are those of Table 10."""
 
     learning_rate: Rate = 1e-3
     """Learning rate of Adam [1e-3]."""
-    batch_size: Annotated[int, Ge(1), Le(65_536)] = static(64)
-    """Number of transitions in an update [64]."""
     discount: Fraction = 0.95
     """Discount factor per decision [0.95]."""
-    epsilon: Fraction = 0.1
-    """Probability with which the high level chooses a random goal [0.1]."""
     kl: NotNegative = 0.5
     """Weight of the divergence from the goal prior in the reward of a decision [0.5]."""
-    target_interval: Annotated[int, Ge(1), Le(1_000_000)] = 10
-    """Number of updates between two replacements of the target network [10]."""
     sees_goal: bool = static(False)
     """Whether the high level sees the task goal g^M; the paper does not say."""
     reads: Literal["observation", "history"] = static("observation")
@@ -117,10 +118,42 @@ class PtgmHyper:
 
 
 @dataclass(frozen=True)
+class PtgmHyper(HighLevelHyper):
+    """Hyper-parameters of PTGM. Values in brackets are those of Table 10."""
+
+    batch_size: Annotated[int, Ge(1), Le(65_536)] = static(64)
+    """Number of transitions in an update [64]."""
+    epsilon: Fraction = 0.1
+    """Probability with which the high level chooses a random goal [0.1]."""
+    target_interval: Annotated[int, Ge(1), Le(1_000_000)] = 10
+    """Number of updates between two replacements of the target network [10]."""
+
+
+@dataclass(frozen=True)
 class PtgmGoalHyper(PtgmHyper):
     """Hyper-parameters of PTGM whose high level sees the task goal."""
 
     sees_goal: bool = static(True)
+
+
+@dataclass(frozen=True)
+class PtgmPpoHyper(ClipHyper, HighLevelHyper):
+    """Hyper-parameters of PTGM by PPO over clusters of goals.
+
+    Those that Table 10 gives are of Table 10, all others but the size of a round of PTGM's own code
+    (PKU-RL/PTGM).
+    """
+
+    clusters: Annotated[int, Ge(1), Le(65_536)] | None = static(None)
+    """Number of clusters of goals (default: 50 as in its kitchen, or all goals where there are fewer)."""
+    round_episodes: Annotated[int, Ge(1), Le(1_000)] = static(5)
+    """Number of episodes between two updates of the high level (its code: 40 decisions)."""
+    epochs: Annotated[int, Ge(1), Le(1_000)] = static(5)
+    value_weight: NotNegative = 1.0
+    clip_norm: Positive = 0.5
+    """Largest global norm of a gradient."""
+    starts_as_prior: bool = static(True)
+    """Whether the policy is the goal prior at first, as in PTGM's kitchen, or uniform."""
 
 
 @dataclass(frozen=True)
@@ -202,6 +235,15 @@ PTGM_GOAL = Method(
     make=f"{_PTGM}:make_ptgm",
     check=f"{_PTGM}:check_ptgm",
     hyper=PtgmGoalHyper,
+    policy="ptgm",
+)
+PTGM_PPO = Method(
+    name="ptgm-ppo",
+    title="PTGM (PPO, clusters of goals)",
+    summary="PPO chooses among clusters of goals for a commanded low level, as PTGM's own code does",
+    make=f"{_PTGM}_ppo:make_ptgm_ppo",
+    check=f"{_PTGM}_ppo:check_ptgm_ppo",
+    hyper=PtgmPpoHyper,
     policy="ptgm",
 )
 PTGM_RANDOM = Method(

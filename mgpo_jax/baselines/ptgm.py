@@ -4,7 +4,7 @@ Every k steps the high level chooses one of the world's goals, and the low level
 reach it. The high level is a multilayer perceptron that is trained by deep Q-learning on one task, with
 epsilon-greedy choices and a penalty for departing from the goal prior: r' = R - w KL(pi, p), where R is the
 undiscounted sum of the k rewards and pi the epsilon-greedy policy that chose. The PTGM of its own paper is
-a different method: its goals are clusters of observations, and it is trained by PPO or SAC.
+a different method: its goals are clusters of observations, and it is trained by PPO (``ptgm_ppo``) or SAC.
 
 The paper does not say what the high level sees, how often it is updated, how many transitions are collected
 first, nor how it is judged. Here it sees the embedded observation, and in one variant also the task goal
@@ -47,7 +47,7 @@ from mgpo_jax.baselines.hierarchy import (
     remember,
     transitions,
 )
-from mgpo_jax.baselines.methods import PtgmHyper
+from mgpo_jax.baselines.methods import HighLevelHyper, PtgmHyper
 from mgpo_jax.methods import NoHyper, Setting
 from mgpo_jax.trees import choose
 
@@ -99,6 +99,19 @@ def targets(
     return reward + jnp.where(done, 0.0, discount * next_values.max(axis=-1))
 
 
+def input_width(config: CommandConfig, hyper: HighLevelHyper) -> int:
+    """I, the number of numbers that the high level sees."""
+    return config.embed_dim + hyper.sees_goal * config.goal_dim
+
+
+def seen_by(
+    hyper: HighLevelHyper, view: View, task_goal: Float[Array, "*batch G"]
+) -> Float[Array, "*batch I"]:
+    """The input of the high level."""
+    read = view.features if hyper.reads == "history" else view.obs
+    return jnp.concatenate([read, task_goal], axis=-1) if hyper.sees_goal else read
+
+
 class Ptgm:
     """PTGM on one task; all methods are pure.
 
@@ -126,7 +139,7 @@ class Ptgm:
         )
 
     def init(self, key: PRNGKeyArray, task_goal: Float[Array, "G"]) -> Learner:
-        width = self.config.embed_dim + self.hyper.sees_goal * self.config.goal_dim
+        width = input_width(self.config, self.hyper)
         params = self.q.init(key, jnp.zeros(width))
         number = jnp.zeros(())
         kept = Kept(jnp.zeros(width), number.astype(jnp.int32), number)
@@ -148,7 +161,7 @@ class Ptgm:
         def decide(key: PRNGKeyArray, view: View, world: State) -> tuple[Array, Kept]:
             del world
             key_whether, key_which = jax.random.split(key)
-            seen = self._seen(view, state.task_goal)
+            seen = seen_by(self.hyper, view, state.task_goal)
             best = jnp.argmax(self.q.apply(state.params, seen))
             other = jax.random.randint(key_which, (), 0, self.q.num_outputs)
             explores = jax.random.uniform(key_whether) < choice.epsilon
@@ -157,11 +170,6 @@ class Ptgm:
             return goal, Kept(seen, goal, greedy_divergence(choice.epsilon, best, log_p))
 
         return hierarchical(self.low, decide, self.config.skill_steps, self.config.horizon)
-
-    def _seen(self, view: View, task_goal: Array) -> Float[Array, "I"]:
-        """The input of the high level."""
-        read = view.features if self.hyper.reads == "history" else view.obs
-        return jnp.concatenate([read, task_goal]) if self.hyper.sees_goal else read
 
     def tell(self, key: PRNGKeyArray, state: Learner, choice: Choice, episodes: Episode) -> Learner:
         """Add an episode to the replay buffer, and update once for every decision in it."""

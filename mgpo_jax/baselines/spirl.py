@@ -20,13 +20,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from envs.agents import Agent
 from envs.base import Episode, State
 from envs.errors import UsageError
 from mgpo_jax.adaptation import Adapter
 from mgpo_jax.baselines.hierarchy import (
+    Choice,
     Mlp,
     Replay,
     Transitions,
@@ -49,13 +50,6 @@ from mgpo_jax.baselines.skills import (
 )
 from mgpo_jax.methods import NoHyper, Setting
 from mgpo_jax.trees import choose
-
-
-class Choice(NamedTuple):
-    """How the high level chooses latents in an episode."""
-
-    greedy: Bool[Array, "*batch"]
-    """Whether it takes the mean of its distribution instead of a sample."""
 
 
 class Kept(NamedTuple):
