@@ -331,9 +331,13 @@ def test_a_weight_of_zero_is_q_learning_without_a_prior(params):
 
         return told(state).params
 
-    first, second = (jax.tree.leaves(learned(low, hyper)) for low in (params, other))
-    for a, b in zip(first, second, strict=True):
-        np.testing.assert_array_equal(a, b)
+    first, *others = (
+        jax.tree.leaves(learned(low, replace(hyper, kl_of=kl_of)))
+        for low, kl_of in ((params, "policy"), (other, "policy"), (other, "goal"))
+    )
+    for second in others:
+        for a, b in zip(first, second, strict=True):
+            np.testing.assert_array_equal(a, b)
     weighed = jax.tree.leaves(learned(other, replace(hyper, kl=0.5)))
     assert any(np.any(np.asarray(a != b)) for a, b in zip(first, weighed, strict=True))
 

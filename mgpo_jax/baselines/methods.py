@@ -127,6 +127,9 @@ class PtgmHyper(HighLevelHyper):
     """Probability with which the high level chooses a random goal [0.1]."""
     target_interval: Annotated[int, Ge(1), Le(1_000_000)] = 10
     """Number of updates between two replacements of the target network [10]."""
+    kl_of: Literal["policy", "goal"] = static("policy")
+    """Whose divergence from the prior is charged: that of the policy which chose, whatever it chose, or of
+    the goal alone that was chosen, as if it were chosen always; the paper does not say."""
 
 
 @dataclass(frozen=True)

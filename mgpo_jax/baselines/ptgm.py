@@ -3,8 +3,10 @@
 Every k steps the high level chooses one of the world's goals, and the low level (``commanded``) tries to
 reach it. The high level is a multilayer perceptron that is trained by deep Q-learning on one task, with
 epsilon-greedy choices and a penalty for departing from the goal prior: r' = R - w KL(pi, p), where R is the
-undiscounted sum of the k rewards and pi the epsilon-greedy policy that chose. The PTGM of its own paper is
-a different method: its goals are clusters of observations, and it is trained by PPO (``ptgm_ppo``) or SAC.
+undiscounted sum of the k rewards and pi the epsilon-greedy policy that chose. This divergence is the same
+for an explored goal. With ``kl_of="goal"`` it is that of always choosing the goal that was chosen, so that
+r' = R + w log p(g), which is the same where nothing is explored. The PTGM of its own paper is a different
+method: its goals are clusters of observations, and it is trained by PPO (``ptgm_ppo``) or SAC.
 
 The paper does not say what the high level sees, how often it is updated, how many transitions are collected
 first, nor how it is judged. Here it sees the embedded observation, and in one variant also the task goal
@@ -66,7 +68,7 @@ class Kept(NamedTuple):
     """The input of the high level."""
     goal: Int[Array, "*batch"]
     divergence: Float[Array, "*batch"]
-    """KL(pi, p) between the epsilon-greedy policy and the prior, in nats."""
+    """KL(pi, p) between the policy that is charged and the prior, in nats."""
 
 
 class Learner(NamedTuple):
@@ -81,7 +83,7 @@ class Learner(NamedTuple):
 
 
 def greedy_divergence(
-    epsilon: Float[Array, ""], best: Int[Array, ""], log_p: Float[Array, "N"]
+    epsilon: float | Float[Array, ""], best: Int[Array, ""], log_p: Float[Array, "N"]
 ) -> Float[Array, ""]:
     """KL(pi, p) for the epsilon-greedy policy pi over N goals whose greedy choice is ``best``."""
     num = len(log_p)
@@ -167,7 +169,11 @@ class Ptgm:
             explores = jax.random.uniform(key_whether) < choice.epsilon
             goal = jnp.where(explores, other, best)
             log_p = log_prior(self.config, self.low_params, view)
-            return goal, Kept(seen, goal, greedy_divergence(choice.epsilon, best, log_p))
+            if self.hyper.kl_of == "goal":
+                away = greedy_divergence(0.0, goal, log_p)
+            else:
+                away = greedy_divergence(choice.epsilon, best, log_p)
+            return goal, Kept(seen, goal, away)
 
         return hierarchical(self.low, decide, self.config.skill_steps, self.config.horizon)
 
