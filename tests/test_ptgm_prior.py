@@ -1,4 +1,4 @@
-"""PTGM's prior over goals: what leaving it costs the high level."""
+"""PTGM's prior over goals: what the network learns of it, and what leaving it costs the high level."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from test_ptgm import CONFIG, ENV, SETTING, episode_of, make_params, rule_of
 
-from mgpo_jax.baselines import ptgm
-from mgpo_jax.baselines.commanded import View, log_prior
+from envs.base import Trajectory
+from mgpo_jax.baselines import commanded, ptgm
+from mgpo_jax.baselines.commanded import View, commanded_loss, log_prior
 from mgpo_jax.baselines.methods import PtgmHyper
 from mgpo_jax.baselines.ptgm import Choice, Ptgm
 
@@ -70,3 +72,42 @@ def test_with_a_large_weight_of_its_goals_the_choice_is_the_priors(params, view)
     values = learn(jax.random.split(jax.random.key(3), 4))
     assert (jnp.argmax(values, axis=1) == jnp.argmax(log_p)).all()
     np.testing.assert_allclose(values.max(axis=1), log_p.max(), atol=0.2)
+
+
+def test_the_prior_is_as_often_right_as_goals_are_reached():
+    """Of a table of counts, its cross-entropy becomes the entropy of the goal given the observation."""
+    counts = np.array([[6, 3, 1], [1, 1, 8]])
+    rows = [(kind, goal) for kind in range(2) for goal in range(3)]
+    kinds, goals = (jnp.array(column) for column in zip(*rows, strict=True))
+    weights = jnp.asarray(counts.reshape(-1) / counts.sum(), jnp.float32)
+    p = counts / counts.sum(axis=1, keepdims=True)
+    entropy = -np.sum(counts * np.log(p)) / counts.sum()
+    config = replace(CONFIG, arrived=0.0)
+
+    def trajectory(kind: jax.Array, goal: jax.Array) -> Trajectory:
+        achieved = jnp.eye(NUM)[goal][None]
+        obs = jnp.zeros((1, *config.obs_shape)).at[0, kind].set(1.0)
+        none = jnp.zeros(1, jnp.int32)
+        return Trajectory(obs, none, achieved, jnp.ones(1, bool), achieved, jnp.int32(1))
+
+    told = jax.vmap(trajectory)(kinds, goals)
+
+    def loss(params: Any) -> tuple[jax.Array, jax.Array]:
+        one = lambda told: commanded_loss(params, jax.random.key(0), config, told, True)  # noqa: E731
+        losses, stats = jax.vmap(one)(told)
+        return weights @ losses, weights @ stats.parts["prior"]
+
+    optimizer = optax.adam(1e-2)
+
+    def step(carry: Any, index: jax.Array) -> tuple[Any, jax.Array]:
+        params, state = carry
+        grads, surprise = jax.grad(loss, has_aux=True)(params)
+        updates, state = optimizer.update(grads, state)
+        return (optax.apply_updates(params, updates), state), surprise
+
+    start = commanded.init(jax.random.key(0), config)
+    run = jax.jit(lambda carry: jax.lax.scan(step, carry, jnp.arange(200))[1])
+    surprise = run((start, optimizer.init(start)))
+    assert surprise[0] > 1.05 * entropy
+    np.testing.assert_allclose(surprise[-1], entropy, rtol=0.01)
+    assert surprise.min() > entropy - 1e-4
