@@ -28,6 +28,8 @@ _UNREACHED = 256  # smallest number of steps that states without a known way to 
 # A rank packs three numbers in base 1024, most significant first: the expected steps, the steps left at the
 # best moment, and for how long the rehearsal kept to a shortest path.
 _DIGITS = 1024
+UNRANKED = jnp.iinfo(jnp.int32).max
+"""The rank of a prompt that was not rehearsed, which is worse than all others."""
 
 ARRIVES, LEAVES, FAILS = range(3)
 
@@ -113,15 +115,33 @@ class Rehearsal(NamedTuple):
     """Progress at the best moment: how many steps closer to the goal it was than at the start."""
 
 
-def rehearse(world: Seen, policy: Policy, ahead: Ahead, prompts: Prompt) -> Rehearsal:
-    """Rehearse C prompts with greedy actions.
+def not_rehearsed(num: int) -> Rehearsal:
+    """The entries of prompts [num] that were not rehearsed."""
+    blank = (FAILS, FAR, UNRANKED, 0, 0)
+    return Rehearsal(*(jnp.full(num, value, jnp.int32) for value in blank))
+
+
+def rehearse(
+    world: Seen,
+    policy: Policy,
+    ahead: Ahead,
+    prompts: Prompt,
+    wanted: int | Int[Array, ""] | None = None,
+) -> Rehearsal:
+    """Rehearse prompts with greedy actions.
 
     Args:
       world: the known part of the world.
       policy: the policy that acts.
       ahead: the task.
-      prompts: the C prompts.
+      prompts: C prompts.
+      wanted: how many of the prompts are rehearsed, beginning with the first one; None means all.
+
+    Returns:
+      The results of all C prompts. Those that were not rehearsed have the rank ``UNRANKED``.
     """
+    num = len(prompts.mask)
+    wanted = num if wanted is None else wanted
     greedy = jnp.ones((), bool)
 
     def run(prompt: Prompt) -> Rehearsal:
@@ -129,7 +149,17 @@ def rehearse(world: Seen, policy: Policy, ahead: Ahead, prompts: Prompt) -> Rehe
         steps = episode.trajectory
         return _result(steps.achieved_goals[:, 0].astype(jnp.int32), steps.length, ahead)
 
-    return jax.lax.map(run, prompts, batch_size=TOGETHER)
+    def run_batch(index: Array, results: Rehearsal) -> Rehearsal:
+        rows = index * TOGETHER + jnp.arange(TOGETHER)
+        batch = jax.tree.map(lambda leaf: leaf[jnp.minimum(rows, num - 1)], prompts)
+        return jax.tree.map(lambda all_, new: all_.at[rows].set(new), results, jax.vmap(run)(batch))
+
+    results = not_rehearsed(-(-num // TOGETHER) * TOGETHER)
+    results = jax.lax.fori_loop(0, -(-wanted // TOGETHER), run_batch, results)
+    rehearsed = jnp.arange(num) < wanted
+    return jax.tree.map(
+        lambda all_, blank: jnp.where(rehearsed, all_[:num], blank), results, not_rehearsed(num)
+    )
 
 
 def _result(way: Int[Array, "T"], length: Int[Array, ""], ahead: Ahead) -> Rehearsal:

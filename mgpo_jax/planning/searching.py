@@ -17,10 +17,12 @@ from mgpo_jax.planning.rehearsal import (
     ARRIVES,
     FAILS,
     LEAVES,
+    UNRANKED,
     Ahead,
     Rehearsal,
     Seen,
     any_of,
+    not_rehearsed,
     rehearse,
 )
 from mgpo_jax.planning.steering import deficits, lead_along, steer
@@ -121,6 +123,27 @@ class Pool(NamedTuple):
     rehearsal: Rehearsal
 
 
+class Turn(NamedTuple):
+    """The state of a search between two turns, in each of which prompts are made and rehearsed."""
+
+    number: Int[Array, ""]
+    """Number of turns so far."""
+    pool: Pool
+    led: Prompt
+    """The prompts that were steered last [NUM_LED]."""
+    num_rehearsed: Int[Array, ""]
+
+
+class Made(NamedTuple):
+    """The prompts that a turn rehearses."""
+
+    prompts: Prompt
+    """Prompts [NUM_PROMPTS], of which the first ``num`` count."""
+    num: Int[Array, ""]
+    led: Prompt
+    """The prompts that were steered last [NUM_LED]."""
+
+
 def nothing_found(memory: Memory) -> Found:
     """The result when no search was made."""
     prompt = jax.tree.map(lambda rows: rows[0], memory.kept)
@@ -142,11 +165,12 @@ class Quest(NamedTuple):
     def task_goal(self) -> Float[Array, "G"]:
         return self.table.goals[self.way.end]
 
-    def tried(self, prompts: Prompt) -> Pool:
+    def tried(self, made: Made) -> Pool:
         """Rehearse prompts; returns them with the results."""
-        way = self.way
+        way, tools = self.way, self.tools
         ahead = Ahead(self.table, way.start, way.end, way.left, self.limit)
-        return Pool(prompts, rehearse(self.tools.world, self.tools.policy, ahead, prompts))
+        found = rehearse(tools.world, tools.policy, ahead, made.prompts, made.num)
+        return Pool(made.prompts, found)
 
     def changed(self, key: PRNGKeyArray, prompt: Prompt, around: Int[Array, ""]) -> Prompt:
         """Mutate a prompt, see ``proposals.changed``."""
@@ -180,38 +204,49 @@ def search_prompts(
     fresh = random_prompts(
         key_random, way.goals, quest.task_goal, space.num_slots, space.longest, NUM_PROMPTS
     )
-    pool = _best(quest.tried(_first_prompts(memory, fresh)))
+    kinds: list[Callable[[Turn], Made]] = [
+        lambda turn: Made(_first_prompts(memory, fresh), jnp.int32(NUM_PROMPTS), turn.led),
+        partial(_children, key_rounds, quest),
+        *(partial(_steered, key_led, quest, fresh, length) for length in _lengths_led(tools)),
+    ]
 
-    def unfinished(carry: tuple[Array, Pool]) -> Bool[Array, ""]:
-        return (carry[0] < tools.features.rounds) & ~_has_shortest(carry[1], way.steps)
+    def take(turn: Turn) -> Turn:
+        made = jax.lax.switch(_next_kind(quest, turn), kinds, turn)
+        pool = _best(_concatenated(turn.pool, quest.tried(made)))
+        return Turn(turn.number + 1, pool, made.led, turn.num_rehearsed + made.num)
 
-    def change(carry: tuple[Array, Pool]) -> tuple[Array, Pool]:
-        index, pool = carry
-        keys = jax.random.split(jax.random.fold_in(key_rounds, index), NUM_PROMPTS)
-        children = jax.vmap(lambda key: _child(key, quest, pool))(keys)
-        return index + 1, _best(_concatenated(pool, quest.tried(children)))
-
-    num_rounds, pool = jax.lax.while_loop(unfinished, change, (jnp.int32(0), pool))
-    num, led = NUM_PROMPTS * (1 + num_rounds), memory.led
-    if tools.features.steering and tools.policy.score is not None:
-        lengths = sorted({min(length, space.horizon) for length in LENGTHS_LED})
-        room = jnp.array(lengths)
-        needed = ~_has_shortest(pool, way.steps) & (way.steps <= room[-1])
-        branches: list[Callable[[Pool], tuple[Pool, Prompt]]] = [
-            lambda pool: (pool, led),
-            *(partial(_steered, key_led, quest, fresh, led, longest) for longest in lengths),
-        ]
-        which = jnp.where(needed, 1 + jnp.sum(way.steps > room), 0)
-        pool, led = jax.lax.switch(which, branches, pool)
-        num += NUM_LED * needed
+    first = Turn(jnp.int32(0), Pool(fresh, not_rehearsed(NUM_PROMPTS)), memory.led, jnp.int32(0))
+    # All turns share one loop, so that the program contains the rehearsal, its largest part, only once.
+    last: Turn = jax.lax.while_loop(lambda turn: _next_kind(quest, turn) < len(kinds), take, first)
+    pool = last.pool
     sooner = pool.rehearsal.steps < verified
     sooner &= ~jax.vmap(partial(is_tried, prompts))(pool.prompts)
     return Found(
-        memory=Memory(_rows(pool.prompts, NUM_KEPT), led, jnp.ones((), bool)),
+        memory=Memory(_rows(pool.prompts, NUM_KEPT), last.led, jnp.ones((), bool)),
         sure=_offer(pool, sooner & (pool.rehearsal.ends == ARRIVES)),
         hopeful=_offer(pool, sooner & (pool.rehearsal.ends == LEAVES)),
-        num_rehearsed=num,
+        num_rehearsed=last.num_rehearsed,
     )
+
+
+def _lengths_led(tools: Tools) -> list[int]:
+    """The capacities, in steps, for a path that prompts are steered along; none without steering."""
+    if not tools.features.steering or tools.policy.score is None:
+        return []
+    return sorted({min(length, tools.space.horizon) for length in LENGTHS_LED})
+
+
+def _next_kind(quest: Quest, turn: Turn) -> Int[Array, ""]:
+    """Which prompts the next turn makes: 0 first ones, 1 mutated ones, from 2 on steered ones, by the
+    capacity for the path. The number after the last of these ends the search."""
+    steps, rounds = quest.way.steps, quest.tools.features.rounds
+    lengths = _lengths_led(quest.tools)
+    end = 2 + len(lengths)
+    steers = 2 + sum(((steps > length).astype(jnp.int32) for length in lengths), start=0)
+    # Prompts are steered once at most, after all rounds of mutated ones.
+    later = jnp.where(turn.number <= rounds, 1, jnp.where(turn.number == rounds + 1, steers, end))
+    later = jnp.where(_has_shortest(turn.pool, steps), end, later)
+    return jnp.where(turn.number == 0, 0, later)
 
 
 def _first_prompts(memory: Memory, fresh: Prompt) -> Prompt:
@@ -234,6 +269,13 @@ def _has_shortest(pool: Pool, known: Int[Array, ""]) -> Bool[Array, ""]:
     return (pool.rehearsal.ends[0] == ARRIVES) & (pool.rehearsal.steps[0] <= known)
 
 
+def _children(key: PRNGKeyArray, quest: Quest, turn: Turn) -> Made:
+    """Mutated prompts."""
+    keys = jax.random.split(jax.random.fold_in(key, turn.number - 1), NUM_PROMPTS)
+    children = jax.vmap(lambda key: _child(key, quest, turn.pool))(keys)
+    return Made(children, jnp.int32(NUM_PROMPTS), turn.led)
+
+
 def _child(key: PRNGKeyArray, quest: Quest, pool: Pool) -> Prompt:
     """Mutate one of the best prompts once or twice, sometimes after crossing it with another one."""
     key_parent, key_cross, key_crosses, key_where, key_change = jax.random.split(key, 5)
@@ -250,19 +292,14 @@ def _child(key: PRNGKeyArray, quest: Quest, pool: Pool) -> Prompt:
     return choose(jax.random.bernoulli(key_more), twice, once)
 
 
-def _steered(
-    key: PRNGKeyArray, quest: Quest, fresh: Prompt, led: Prompt, longest: int, pool: Pool
-) -> tuple[Pool, Prompt]:
-    """Steer the most promising prompts along the known path and add them to the pool.
+def _steered(key: PRNGKeyArray, quest: Quest, fresh: Prompt, longest: int, turn: Turn) -> Made:
+    """The most promising prompts, steered along the known path.
 
-    Candidates are the prompts that were steered last (``led``), mutations of them, the best ones of the
-    pool and random ones (``fresh``); those of the smallest deficits are steered. The path may have up to
-    ``longest`` steps.
-
-    Returns:
-      The new pool, and the steered prompts [NUM_LED].
+    Candidates are the prompts that were steered last, mutations of them, the best ones of the pool and
+    random ones (``fresh``); those of the smallest deficits are steered. The path may have up to ``longest``
+    steps.
     """
-    way = quest.way
+    way, pool, led = quest.way, turn.pool, turn.led
     lead = lead_along(quest.table, way.start, way.states, longest)
     tools, stride = quest.tools, quest.table.stride
     change = lambda key, prompt: quest.changed(key, prompt, pool.rehearsal.strays[0])  # noqa: E731
@@ -271,7 +308,8 @@ def _steered(
     chosen = jnp.argsort(deficits(tools.policy, lead, first))[:NUM_LED]
     first = jax.tree.map(lambda rows: rows[chosen], first)
     moved, _ = steer(tools.policy, lead, first, stride, tools.features.steering)
-    return _best(_concatenated(pool, quest.tried(moved))), moved
+    prompts = jax.tree.map(lambda all_, some: all_.at[:NUM_LED].set(some), pool.prompts, moved)
+    return Made(prompts, jnp.int32(NUM_LED), moved)
 
 
 def _concatenated(*trees: Any) -> Any:
@@ -296,9 +334,11 @@ def _best(pool: Pool) -> Pool:
     end."""
     rehearsal = pool.rehearsal
     num = len(rehearsal.rank)
-    # Prompts of the same rank count as duplicates.
+    # Prompts of the same rank count as duplicates. Those that were not rehearsed come after all others.
     again = jnp.any(jnp.tril(rehearsal.rank[:, None] == rehearsal.rank, -1), axis=-1)
-    order = jnp.argsort(jnp.where(again, jnp.iinfo(jnp.int32).max, rehearsal.rank))
+    missing = rehearsal.rank == UNRANKED
+    rank = jnp.where(again & ~missing, UNRANKED - 1, rehearsal.rank)
+    order, again = jnp.argsort(rank), again | missing
     pool = jax.tree.map(lambda rows: rows[order], pool)
     ends, again = pool.rehearsal.ends, again[order]
     is_end = ends[:, None] == jnp.array([ARRIVES, LEAVES, FAILS])
