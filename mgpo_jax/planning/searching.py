@@ -72,7 +72,7 @@ class Tools(NamedTuple):
     world: Seen
     policy: Policy
     features: Features
-    draws_goals: bool = True
+    draws_goals: bool
     """Whether the world draws random goals (``SearchSpace.sample_goal``)."""
 
 
