@@ -23,14 +23,19 @@ MAX_SEGMENTS = 8
 SEGMENT_STEPS = 32  # length of the shortest segment, in steps
 
 
-def num_segments(horizon: int) -> int:
-    """The number of segments of an episode with at most ``horizon`` steps."""
-    return max(1, min(MAX_SEGMENTS, horizon // SEGMENT_STEPS))
+def num_segments(horizon: int, most: int | None = None) -> int:
+    """The number of segments of an episode with at most ``horizon`` steps.
+
+    Args:
+      horizon: the largest number of steps.
+      most: the world's own limit on segments, if it has one (``Engine.max_segments``).
+    """
+    return max(1, min(MAX_SEGMENTS, most or MAX_SEGMENTS, horizon // SEGMENT_STEPS))
 
 
-def segment_length(horizon: int) -> int:
-    """The number of steps in a segment; the last one may be shorter."""
-    return -(-horizon // num_segments(horizon))
+def segment_length(horizon: int, most: int | None = None) -> int:
+    """The number of steps in a segment; the last one may be shorter. Arguments as of ``num_segments``."""
+    return -(-horizon // num_segments(horizon, most))
 
 
 @jax.custom_batching.custom_vmap
@@ -96,7 +101,8 @@ def run_episode(key: PRNGKeyArray, env: Environment, agent: Agent, task: Task) -
         return _act(env, agent, loop._replace(alive=loop.alive & ~quits, memory=memory), action)
 
     # With a memory of fixed size one segment suffices, which compiles in a fraction of the time.
-    segment = horizon if agent.grow is keeps_its_size else segment_length(horizon)
+    grows = agent.grow is not keeps_its_size
+    segment = segment_length(horizon, env.engine.max_segments) if grows else horizon
     for start in range(1, horizon, segment):
         end = min(start + segment, horizon)
         loop = loop._replace(memory=agent.grow(loop.memory, end - start))

@@ -124,7 +124,10 @@ class Engine:
       worlds_together: smallest efficient batch of worlds in a step, for engines with a high overhead per
         call.
       compiler_options: XLA options for such programs, as pairs of name and value.
+      max_segments: largest number of segments of an episode (``envs.episodes``), for worlds whose step
+        takes long to compile, since each segment has its own copy of it.
     """
 
     worlds_together: int = 1
     compiler_options: tuple[tuple[str, bool], ...] = ()
+    max_segments: int | None = None

@@ -13,6 +13,7 @@ from jax.extend.core import jaxprs_in_params
 import envs
 from envs.agents import Agent
 from envs.episodes import MAX_SEGMENTS, num_segments, replay, run_episode
+from envs.specs import Engine
 from envs.wrappers import Noisy
 
 MAZE = envs.make("maze15")
@@ -189,9 +190,11 @@ def test_what_an_agent_intended_is_kept_beside_what_it_did():
     np.testing.assert_array_equal(silent.labels, silent.actions)
 
 
-def test_memory_grows_to_the_length_of_the_episode():
+@pytest.mark.parametrize("most", [None, 1])
+def test_memory_grows_to_the_length_of_the_episode(monkeypatch, most):
     """An agent is given room before each segment, in all for every step after the first."""
     env = GRID
+    monkeypatch.setattr(type(env), "engine", Engine(max_segments=most))
     task = env.sample_task(jax.random.key(3))
     grown = []
 
@@ -207,7 +210,7 @@ def test_memory_grows_to_the_length_of_the_episode():
     )
     episode = jax.jit(lambda key: run_episode(key, env, agent, task))(jax.random.key(0))
     assert sum(grown) == env.spec.horizon - 1
-    assert len(grown) == num_segments(env.spec.horizon)
+    assert len(grown) == num_segments(env.spec.horizon, most)
     assert episode.decisions.shape == (env.spec.horizon,)
 
 
@@ -216,3 +219,4 @@ def test_memory_grows_to_the_length_of_the_episode():
 )
 def test_segments(horizon, num):
     assert num_segments(horizon) == num
+    assert num_segments(horizon, 4) == min(num, 4)
