@@ -2,7 +2,8 @@
 
 python -m examples.over_time RUN ..
 
-The runs must be of one world. The last column has the standard deviation over seeds as well.
+The runs must be of one world. The last return of a run has the standard deviation over seeds as well. Cells
+are empty where a run was not evaluated: methods that learn nothing may have one episode.
 """
 
 from __future__ import annotations
@@ -30,10 +31,12 @@ def over_time(folder: Path) -> list[str]:
     one_seed = " (one seed)" if row.summary["num_seeds"] == 1 else ""
     with np.load(folder / "results.npz") as arrays:
         after, returns = arrays["eval_episodes"].tolist(), arrays["eval_returns"].astype(np.float64)
-    spreads = [seed_spread(returns[:, :, after.index(episode)]) for episode in EPISODES]
+    known = [episode for episode in EPISODES if episode in after]
+    spreads = [seed_spread(returns[:, :, after.index(episode)]) for episode in known]
     means = [f"{spread.mean:.2f}" for spread in spreads]
     if spreads[-1].std is not None:
         means[-1] += f" ± {spreads[-1].std:.2f}"
+    means += [""] * (len(EPISODES) - len(known))
     paper = paper_final(row.summary["env"], method) if row.like_the_paper else ""
     return [f"`{' '.join([method, *flags])}`{one_seed}", *means, paper]
 
