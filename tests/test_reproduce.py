@@ -462,8 +462,8 @@ def test_the_inventory_counts_prices_and_doubts(tmp_path: Path) -> None:
     rows = rows_of("maze15")
     assert rows["table2"][:2] == ["maze15", "6 of 6"]  # all published
     assert rows["table2"][3] == ""
-    # All but the policy itself, which acts for next to nothing, and PPO over clusters of goals.
-    assert rows["table1"][1] == "10 of 12"
+    # All but the policy itself, which acts for next to nothing.
+    assert rows["table1"][1] == "11 of 12"
     assert 1 < float(rows["table1"][3]) < 5
     # Of PTGM nothing is published in the larger mazes that tells a price.
     larger = rows_of("maze30")["table1"]
