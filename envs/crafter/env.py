@@ -49,7 +49,7 @@ NUM_PLACE = 3  # components of a goal's place: whether it is known, rows and col
 # policy's whole key-value cache at every step.
 WORLDS_TOGETHER = 16
 MAX_SEGMENTS = 4
-"""With eight segments the first command compiles for half as long again, and episodes are hardly faster."""
+"""With eight segments the first command compiles for half as long again, and a search was no faster."""
 
 
 class CrafterTask(NamedTuple):
