@@ -37,7 +37,8 @@ def initial_policy(config: PretrainConfig, spec: EnvSpec) -> LoadedPolicy | None
         policy = read_policy(initial_folder(config), spec, config.method)
     except DataError as error:
         raise DataError(str(error).replace(MEND, mend_initial(config))) from None
-    if (found := kind_of(policy.config).name) != config.method:
+    found = kind_of(policy.config).name
+    if found not in (config.method, *KINDS.find(config.method).load().starts_from):
         raise UsageError(
             f"--method {config.method} cannot start from {config.init}, a network of the kind {found}"
         )
@@ -62,11 +63,16 @@ def configured_network(
       init: the policy that the run starts from, if any.
       spec: describes the data if there is no world.
     """
+    learned = KINDS.find(config.method).load()
     if init is not None:
-        return replace(init.config, dropout=config.dropout)
+        network = replace(init.config, dropout=config.dropout)
+        if isinstance(network, learned.config):
+            return network
+        common = {f.name for f in fields(learned.config)} & {f.name for f in fields(network)}
+        shared = learned.config(**{name: getattr(network, name) for name in common})
+        return learned.complete(shared, env, dataset)
     spec = env.spec if env is not None else spec
     assert spec is not None
-    learned = KINDS.find(config.method).load()
     network = learned.complete(sized_network(config, spec), env, dataset)
     if not config.standardize_obs:
         return network

@@ -45,6 +45,8 @@ class Learned:
       facts: ``(config) -> rows`` of a released network's model card, texts by name; one is ``network``.
       fault: ``(config) -> text``, what is wrong with a config that was read from disk, beyond types and
         ranges; None if nothing is.
+      starts_from: other kinds, by name, whose networks a training may start from. Parameters with the same
+        names and shapes are taken over from them, and the others start from random values.
     """
 
     config: type[NetworkConfig]
@@ -54,6 +56,7 @@ class Learned:
     agent: Callable[[Any, Any, Any], Agent] | None = None
     facts: Callable[[Any], Mapping[str, str]] = lambda config: {"network": "custom architecture"}
     fault: Callable[[Any], str | None] = lambda config: None
+    starts_from: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

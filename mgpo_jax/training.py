@@ -48,6 +48,7 @@ from mgpo_jax.sharding import (
     split,
     spread,
 )
+from mgpo_jax.trees import taken_over
 from mgpo_jax.weight_updates import make_optimizer
 
 # Entries of a step's metrics that are not reported: whether all weights are finite, and how many processes
@@ -184,6 +185,7 @@ class Trainer:
         self._dataset = dataset
         self._initial_params = partial(learned.init, self._key_init, network_config)
         shapes = jax.eval_shape(self._initial_params)
+        self._structure: Any = jax.tree.structure(shapes)
         blank = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
         _, unravel = ravel_pytree(blank)
         self._flatten = jax.jit(_flatten)
@@ -210,14 +212,21 @@ class Trainer:
         self._part_keys, self._part_stats = part_keys, part_stats
 
     def init(self, params: Any = None) -> TrainState:
-        """The state before the first step, with the given parameters or with random ones (default)."""
+        """The state before the first step, with random parameters or given ones.
+
+        The given ones may be those of another kind of network (``Learned.starts_from``).
+        """
         # On a GPU two large programs compile faster than the 160 small ones of eager execution. The two
         # ways round differently, so CPUs, on which the published policies were trained, stay with the eager
         # one.
         compiled = (lambda function: function) if jax.default_backend() == "cpu" else jax.jit
         # Given parameters are copied, since the first step donates the buffers of its parameters.
         make = compiled(self._initial_params)
-        params = make() if params is None else jax.tree.map(jnp.array, params)
+        if params is None:
+            params = make()
+        else:
+            own = jax.tree.structure(params) == self._structure
+            params = jax.tree.map(jnp.array, params if own else taken_over(make(), params))
         return TrainState(params, compiled(self._optimizer.init)(self._flatten(params)), 0)
 
     def step(

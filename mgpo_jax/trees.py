@@ -23,6 +23,17 @@ def put_row(rows: Any, row: Any, index: Int[Array, ""]) -> Any:
     )
 
 
+def taken_over(fresh: Any, given: Any) -> Any:
+    """The pytree ``fresh``, with the leaves of ``given`` wherever both have one of the same shape."""
+    old = named_leaves(given, lone="")
+
+    def pick(path: Any, new: Any) -> Any:
+        found = old.get(jax.tree_util.keystr(path, simple=True, separator="."))
+        return new if found is None or found.shape != new.shape else found
+
+    return jax.tree_util.tree_map_with_path(pick, fresh)
+
+
 def named_leaves(tree: Any, lone: str) -> dict[str, Any]:
     """The leaves of a pytree by path, such as ``prompt.goals``.
 

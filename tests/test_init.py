@@ -161,6 +161,39 @@ def test_dropout_stays_a_setting_of_the_training(here: Path) -> None:
     assert parsed(ON.replace("--preset smoke", "--preset paper")).num_heads == 4
 
 
+def test_the_low_level_of_ptgm_starts_from_a_multi_goal_policy(command: Run) -> None:
+    """Shared parameters are taken over, the layer of the prior is new, and a resumed run is the same."""
+    line = f"{BASE} --method ptgm --init first/policy --out"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training.runs, "has_begun", lambda folder: False)
+        patch.setattr(training.runs, "begin", lambda *args: None)
+        run = training.Run(parsed(f"{line} new"), "")
+    first = read_policy(Path("first/policy"))
+    found, fresh = run.initial_state().params["params"], run.trainer.init().params["params"]
+    assert set(found) - set(first.params["params"]) == {"prior"}
+    assert set(first.params["params"]) == set(found) - {"prior"}
+    assert_same({name: found[name] for name in set(found) - {"prior"}}, first.params["params"])
+    assert_same(found["prior"], fresh["prior"])
+    assert run.network.obs_mean == first.config.obs_mean != ()
+    assert run.network.max_prompt_length == 1
+    assert len(run.network.commands) == 169
+
+    code, text = command(f"{line} whole")
+    assert code == 0, text
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "asked_to_stop", after_four_steps)
+        assert command(f"{line} cut")[0] == 130
+    code, text = command(f"{line} cut --resume")
+    assert code == 0, text
+    assert_same(weights("cut"), weights("whole"))
+
+
+def test_other_kinds_start_from_networks_of_their_own_only(command: Run) -> None:
+    code, text = command(f"{BASE} --method spirl --init first/policy --out new")
+    assert code == 2
+    assert "--method spirl cannot start from first/policy, a network of the kind mgpo" in text
+
+
 def test_files_say_where_the_training_started(here: Path) -> None:
     sha256 = hash_file(Path("first/policy/weights.npz"))
     assert document("on/meta.json")["init_sha256"] == sha256

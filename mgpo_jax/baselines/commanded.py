@@ -26,7 +26,7 @@ from envs.base import Environment, Goals, Trajectory
 from envs.registry import Judgement
 from mgpo_jax.baselines.hierarchy import LowLevel, hierarchical
 from mgpo_jax.distributions import Distribution
-from mgpo_jax.kinds import Learned
+from mgpo_jax.kinds import MULTI_GOAL, Learned
 from mgpo_jax.losses import Stats, blurred, stats_of, transformer_told
 from mgpo_jax.network_configs import TransformerConfig
 from mgpo_jax.prompts import Prompt
@@ -331,4 +331,5 @@ COMMANDED = Learned(
     agent=prior_agent,
     facts=facts,
     fault=fault,
+    starts_from=(MULTI_GOAL,),
 )
