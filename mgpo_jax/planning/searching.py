@@ -207,7 +207,7 @@ def search_prompts(
     kinds: list[Callable[[Turn], Made]] = [
         lambda turn: Made(_first_prompts(memory, fresh), jnp.int32(NUM_PROMPTS), turn.led),
         partial(_children, key_rounds, quest),
-        *(partial(_steered, key_led, quest, fresh, length) for length in _lengths_led(tools)),
+        *([partial(_steered, key_led, quest, fresh)] if _lengths_led(tools) else []),
     ]
 
     def take(turn: Turn) -> Turn:
@@ -237,14 +237,14 @@ def _lengths_led(tools: Tools) -> list[int]:
 
 
 def _next_kind(quest: Quest, turn: Turn) -> Int[Array, ""]:
-    """Which prompts the next turn makes: 0 first ones, 1 mutated ones, from 2 on steered ones, by the
-    capacity for the path. The number after the last of these ends the search."""
+    """Which prompts the next turn makes: 0 first ones, 1 mutated ones, 2 steered ones. The number after the
+    last of these ends the search."""
     steps, rounds = quest.way.steps, quest.tools.features.rounds
     lengths = _lengths_led(quest.tools)
-    end = 2 + len(lengths)
-    steers = 2 + sum(((steps > length).astype(jnp.int32) for length in lengths), start=0)
+    end = 3 if lengths else 2
     # Prompts are steered once at most, after all rounds of mutated ones.
-    later = jnp.where(turn.number <= rounds, 1, jnp.where(turn.number == rounds + 1, steers, end))
+    steers = (turn.number == rounds + 1) & (steps <= max(lengths, default=0))
+    later = jnp.where(turn.number <= rounds, 1, jnp.where(steers, 2, end))
     later = jnp.where(_has_shortest(turn.pool, steps), end, later)
     return jnp.where(turn.number == 0, 0, later)
 
@@ -287,29 +287,43 @@ def _child(key: PRNGKeyArray, quest: Quest, pool: Pool) -> Prompt:
     strays, farthest = pool.rehearsal.strays[first], pool.rehearsal.farthest[first]
     around = jnp.where(jax.random.bernoulli(key_where), strays, farthest)
     key_once, key_again, key_more = jax.random.split(key_change, 3)
-    once = quest.changed(key_once, parent, around)
-    twice = quest.changed(key_again, once, around)
+
+    def change(prompt: Prompt, key: PRNGKeyArray) -> tuple[Prompt, Prompt]:
+        mutated = quest.changed(key, prompt, around)
+        return mutated, mutated
+
+    # A loop, since a second copy of the mutations would take seconds to compile.
+    twice, both = jax.lax.scan(change, parent, jnp.stack([key_once, key_again]))
+    once = jax.tree.map(lambda rows: rows[0], both)
     return choose(jax.random.bernoulli(key_more), twice, once)
 
 
-def _steered(key: PRNGKeyArray, quest: Quest, fresh: Prompt, longest: int, turn: Turn) -> Made:
+def _steered(key: PRNGKeyArray, quest: Quest, fresh: Prompt, turn: Turn) -> Made:
     """The most promising prompts, steered along the known path.
 
     Candidates are the prompts that were steered last, mutations of them, the best ones of the pool and
-    random ones (``fresh``); those of the smallest deficits are steered. The path may have up to ``longest``
-    steps.
+    random ones (``fresh``); those of the smallest deficits are steered.
     """
-    way, pool, led = quest.way, turn.pool, turn.led
-    lead = lead_along(quest.table, way.start, way.states, longest)
-    tools, stride = quest.tools, quest.table.stride
+    pool, led = turn.pool, turn.led
     change = lambda key, prompt: quest.changed(key, prompt, pool.rehearsal.strays[0])  # noqa: E731
     own = jax.vmap(change)(jax.random.split(key, NUM_LED), led)
     first = _concatenated(led, own, _rows(pool.prompts, NUM_LED), _rows(fresh, NUM_LED))
-    chosen = jnp.argsort(deficits(tools.policy, lead, first))[:NUM_LED]
-    first = jax.tree.map(lambda rows: rows[chosen], first)
-    moved, _ = steer(tools.policy, lead, first, stride, tools.features.steering)
+    lengths = _lengths_led(quest.tools)
+    too_short = [(quest.way.steps > length).astype(jnp.int32) for length in lengths[:-1]]
+    along = [partial(_led, quest, length) for length in lengths]
+    moved = jax.lax.switch(sum(too_short, start=jnp.int32(0)), along, first)
     prompts = jax.tree.map(lambda all_, some: all_.at[:NUM_LED].set(some), pool.prompts, moved)
     return Made(prompts, jnp.int32(NUM_LED), moved)
+
+
+def _led(quest: Quest, longest: int, candidates: Prompt) -> Prompt:
+    """The candidates with the smallest deficits, steered along the path of at most ``longest`` steps."""
+    way, tools = quest.way, quest.tools
+    lead = lead_along(quest.table, way.start, way.states, longest)
+    chosen = jnp.argsort(deficits(tools.policy, lead, candidates))[:NUM_LED]
+    first = jax.tree.map(lambda rows: rows[chosen], candidates)
+    moved, _ = steer(tools.policy, lead, first, quest.table.stride, tools.features.steering)
+    return moved
 
 
 def _concatenated(*trees: Any) -> Any:
