@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -515,21 +516,28 @@ def test_epochs_after_the_end_of_a_round_are_left_out_and_no_bit_changes(
     _, state, query, episodes = round_of_episodes
     hyper = PpoHyper(learning_rate=0.01, kl=0.1, epochs=6)
 
-    def after(stops: bool) -> list[Any]:
-        changed = replace(hyper, max_kl=1e-3 if stops else 1e9)
-        tell = jax.jit(make_ppo(SETTING, params, changed).tell)
-        states = [state]
-        for _ in range(3):
-            states.append(tell(jax.random.key(4), states[-1], query, episodes))
-        return [one.weights for one in states[1:]]
+    def rounds() -> Callable[[float], list[Any]]:
+        @jax.jit
+        def tell(state: Any, max_kl: Any) -> Any:
+            adapter = make_ppo(SETTING, params, with_numbers(hyper, {"max_kl": max_kl}))
+            return adapter.tell(jax.random.key(4), state, query, episodes)
 
-    short, whole = after(True), after(False)
+        def after(max_kl: float) -> list[Any]:
+            states = [state]
+            for _ in range(3):
+                states.append(tell(states[-1], max_kl))
+            return [one.weights for one in states[1:]]
+
+        return after
+
+    after = rounds()
+    short, whole = after(1e-3), after(1e9)
     with pytest.raises(AssertionError):
         assert_equal(short, whole)  # rounds do end early
     monkeypatch.setattr(
         finetune, "repeated", lambda num, epoch, start, _: jax.lax.fori_loop(0, num, epoch, start)
     )
-    assert_equal(short, after(True))
+    assert_equal(short, rounds()(1e-3))
 
 
 def test_values_alone_are_learned_at_first(params: Any, round_of_episodes: Any) -> None:
