@@ -185,7 +185,7 @@ def test_the_published_tables_over_time_are_those_of_the_results(
     """Each stands below the command that prints it."""
     text = (ROOT / "docs/results.md").read_text()
     shown = re.findall(r"    python -m examples.over_time ((?:.|\\\n)+?)\n\n((?:\|.*\n)+)", text)
-    assert len(shown) == 3
+    assert len(shown) == 4
     for words, wanted in shown:
         line = "echo " + words.replace("\\\n", " ")
         folders = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=True)
