@@ -68,8 +68,7 @@ def configured_network(
         network = replace(init.config, dropout=config.dropout)
         if isinstance(network, learned.config):
             return network
-        common = {f.name for f in fields(learned.config)} & {f.name for f in fields(network)}
-        shared = learned.config(**{name: getattr(network, name) for name in common})
+        shared = learned.config(**_common(learned.config, network))
         return learned.complete(shared, env, dataset)
     spec = env.spec if env is not None else spec
     assert spec is not None
@@ -84,9 +83,14 @@ def configured_network(
 def sized_network(config: PretrainConfig, spec: EnvSpec) -> Any:
     """The network config that the settings imply, without anything that depends on the data."""
     learned = KINDS.find(config.method).load()
-    common = {f.name for f in fields(learned.config)} & {f.name for f in fields(PretrainConfig)}
-    sizes = {name: getattr(config, name) for name in common}
+    sizes = _common(learned.config, config)
     return learned.config(**{**sizes, **world_side(spec, config.head, config.encoder)})
+
+
+def _common(network: type[Any], source: Any) -> dict[str, Any]:
+    """The fields of ``source``, by name, that a network's config has as well."""
+    names = {f.name for f in fields(network)} & {f.name for f in fields(source)}
+    return {name: getattr(source, name) for name in names}
 
 
 def moments(obs: np.ndarray, piece: int = 1 << 24) -> tuple[np.ndarray, np.ndarray]:
