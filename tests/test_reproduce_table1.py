@@ -10,7 +10,7 @@ import pytest
 
 import envs
 from envs import episodes
-from experiments import comparisons
+from experiments import comparison_tables, comparisons
 from experiments.reproduce import main
 from experiments.store.reproduce_settings import ReproduceConfig
 from mgpo_jax import methods
@@ -46,7 +46,8 @@ def test_table1_with_all_of_its_methods(
     """Two tasks and fifteen episodes: three rounds of PPO, and SPiRL after its ten of warming up."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(comparisons, "SMOKE_TASKS", 2)
-    monkeypatch.setattr(comparisons, "SMOKE_EPISODES", 15)
+    for module in (comparisons, comparison_tables):
+        monkeypatch.setattr(module, "SMOKE_EPISODES", 15)
     monkeypatch.setattr(episodes, "MAX_SEGMENTS", 1)
     monkeypatch.setattr(comparisons, "load_policy", small)
     main(ReproduceConfig(what="table1", env=WORLDS, scale="smoke"))
