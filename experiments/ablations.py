@@ -28,7 +28,7 @@ from experiments.store.provenance import provenance
 from experiments.store.reproduce_settings import TRAIN_NOTHING, ReproduceConfig
 from experiments.store.result_files import load_results
 from experiments.store.seals import write_sealed
-from experiments.store.settings import DataConfig, PretrainConfig
+from experiments.store.settings import DataConfig, PretrainConfig, file_name
 from experiments.store.statistics import SeedSpread
 from experiments.store.summary import read_summary
 from experiments.store.tables import number, table
@@ -166,6 +166,27 @@ def adapted(
         shutil.rmtree(pieces)
 
 
+def _place(config: ReproduceConfig, name: str, hyper: Any, method: str = "ucb") -> Path:
+    """The results of a row: those of this command if they exist, or published ones of as many seeds.
+
+    Args:
+      config: settings of the command.
+      name: name of the row in a file name.
+      hyper: hyper-parameters of its method; None for the defaults.
+      method: name of its adaptation method.
+    """
+    own = config.folder / config.what / f"{name}-{config.seeds}seeds"
+    settings = AdaptConfig(
+        env=config.world, method=method, seeds=config.seeds, episodes=EPISODES, hyper=hyper
+    )
+    among = PUBLISHED / "ablations" / file_name(config.world) / config.what / name
+    for place in () if own.exists() else (among, None):
+        found = published(config, settings, place)
+        if found is not None and read_summary(found)["num_seeds"] == config.seeds:
+            return found
+    return own
+
+
 def table4(config: ReproduceConfig) -> list[Part]:
     """The maximum prompt length K and the exploration constant c, with the released policy (Table 4).
 
@@ -175,17 +196,13 @@ def table4(config: ReproduceConfig) -> list[Part]:
     own = pretrain_preset(config.world, "fast").max_prompt_length
 
     def part(label: str, name: str, hyper: UcbHyper, together: str) -> Part:
-        results = config.folder / "table4" / f"{name}-{config.seeds}seeds"
-        return Part(label, label, None, hyper, results, together)
+        usual = None if name == f"K{own}" else hyper
+        return Part(label, label, None, hyper, _place(config, name, usual), together)
 
     lengths = [
         part(f"K = {k}", f"K{k}", UCB.hyper_in(world, {"max_goals": k}), "K")
         for k in sorted({1, 2, 3, LONGEST, own})
     ]
-    usual = AdaptConfig(env=config.world, seeds=config.seeds, episodes=EPISODES)
-    place = published(config, usual)
-    if place is not None and read_summary(place)["num_seeds"] == config.seeds:
-        lengths = [x._replace(results=place) if x.name == f"K = {own}" else x for x in lengths]
     constants = [  # Eq. 3 as printed
         part(f"c = {c}", f"c{c}", UcbHyper(c=float(c), max_goals=LONGEST, scale=1.0), "c")
         for c in (0, 1, 10)
@@ -288,7 +305,7 @@ def plan(config: ReproduceConfig) -> list[Part]:
         method = "ucb" if label == "ucb" else "plan"
         hyper = methods.find(method).hyper_in(world, variants.get(label))
         name = label.replace(" ", "-")
-        results = config.folder / "plan" / f"{name}-{config.seeds}seeds"
+        results = _place(config, name, hyper, method)
         parts.append(Part(label, name, None, hyper, results, label, method))
     return parts
 
@@ -316,7 +333,8 @@ def make(config: ReproduceConfig) -> list[Line]:
         folders = {
             part.results: part.hyper for part in parts if PUBLISHED not in part.results.parents
         }
-        adapted(config, policy, folders, parts[0].method)
+        if folders:
+            adapted(config, policy, folders, parts[0].method)
         home = envs.find(config.world).home
         lines += [
             Line(part.label, part.results, paper_value(config.what, home, part.name))
@@ -373,6 +391,7 @@ def as_table(lines: Sequence[Line]) -> str:
 def save(config: ReproduceConfig, text: str, lines: Sequence[Line]) -> None:
     """Write the table and the learning curves of an ablation."""
     place, picture = files_of(config)
+    place.parent.mkdir(parents=True, exist_ok=True)
     results = {line.label: load_results(line.results) for line in lines}
     write(picture, later(learning_curve, results, config.world))
     write_sealed(place, lambda path: path.write_text(text, encoding="utf-8"))

@@ -26,7 +26,7 @@ from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.paper import paper_worlds
 from experiments.store.presets import pretrain_preset
 from experiments.store.reproduce_settings import ReproduceConfig
-from experiments.store.rows import PAPER_EPISODES, read_row
+from experiments.store.rows import PAPER_EPISODES, changed_hyper, read_row
 from experiments.store.settings import file_name
 from experiments.training import train
 from mgpo_jax import methods, processes
@@ -194,12 +194,19 @@ def _train(folder: Path, world: str, kind: str) -> None:
     train(replace(preset, resume=runs.has_begun(folder)), GO_ON)
 
 
-def published(config: ReproduceConfig, settings: AdaptConfig) -> Path | None:
+def published(
+    config: ReproduceConfig, settings: AdaptConfig, place: Path | None = None
+) -> Path | None:
     """The folder of published results with the settings of a cell; None if there are none.
 
     They may be of fewer seeds, and of any number of episodes if the method learns nothing.
+
+    Args:
+      config: settings of the command.
+      settings: settings of the cell.
+      place: where the results would be (default: among those of the world, under the method's name).
     """
-    folder = PUBLISHED / file_name(settings.env) / file_name(settings.method)
+    folder = place or PUBLISHED / file_name(settings.env) / file_name(settings.method)
     if config.scale != "cpu" or not folder.is_dir():
         return None
     try:
@@ -210,7 +217,9 @@ def published(config: ReproduceConfig, settings: AdaptConfig) -> Path | None:
     learns = methods.find(settings.method).learns
     enough = not learns or row.summary["num_episodes"] == settings.episodes
     same = row.tasks == "test" and enough and row.summary["num_seeds"] <= settings.seeds
-    return folder if same and not row.settings.keys() - {"eval_every"} else None
+    differing = {name: text for name, text in row.settings.items() if name != "eval_every"}
+    world = envs.find(settings.env)
+    return folder if same and differing == changed_hyper(settings, world) else None
 
 
 def cells(config: ReproduceConfig) -> Iterator[Cell]:

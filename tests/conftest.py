@@ -40,6 +40,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "slow: runs only with --all")
     config.addinivalue_line("markers", "optimized: runs with programs that compile as for users")
+    # By default xdist begins with the files of many tests, so that a long file of few tests comes last,
+    # while the other process has nothing left to do.
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False
     # XLA reads its flags when jax first needs a device, which happens later.
     os.environ.setdefault("XLA_FLAGS", TWO_DEVICES if config.getoption("--all") else QUICK)
 

@@ -25,12 +25,12 @@ ENV = MazeRunner(name="maze9", side=9, horizon=24)
 
 @pytest.fixture(scope="module")
 def trained() -> tuple[list[float], LoadedPolicy]:
-    """Losses and policy of 1,500 small steps on two devices."""
+    """Losses and policy of 500 small steps on two devices."""
     demonstrator = maze_demonstrators(ENV)["astar4"]._replace(
         keeps=lambda episode: episode.trajectory.length >= 5
     )
     dataset, _ = collect(ENV, demonstrator, 3000, seed=0, num_test_tasks=50)
-    config = TrainConfig(steps=1500, batch_size=32, part_size=16, bucket=24, warmup_steps=20)
+    config = TrainConfig(steps=500, batch_size=32, part_size=16, bucket=24, warmup_steps=20)
     config = TrainConfig(**{**vars(config), "learning_rate": 3e-3})
     network = network_config(ENV.spec, embed_dim=32, num_layers=2, dropout=0.0)
     trainer = Trainer(config, network, dataset, device_mesh(2))

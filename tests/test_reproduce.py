@@ -26,6 +26,7 @@ from experiments import (
 )
 from experiments.reproduce import main
 from experiments.store import reproduce_settings, speeds
+from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.paper import paper_worlds
 from experiments.store.presets import pretrain_preset
 from experiments.store.reproduce_settings import ReproduceConfig
@@ -398,6 +399,41 @@ def test_table4_varies_length_and_constant(tiny: Path, monkeypatch: pytest.Monke
     assert (lines[0].paper, lines[3].paper) == ("-2.63 ± 0.00", "-0.41 ± 0.10")
 
 
+def test_published_rows_are_found_and_not_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Those with the same settings and as many seeds, unless this command made its own."""
+    monkeypatch.setattr(ablations, "adapted", None)  # which would be an error to call
+    config = ReproduceConfig(what="plan", env=("maze30",), out=tmp_path / "new")
+    reproduce.make_ablation(config)
+    text = capsys.readouterr().out
+    assert (tmp_path / "new/maze30/plan.md").read_text().startswith(text.strip())
+    assert (tmp_path / "new/maze30/plan.png").stat().st_size > 0
+    places = {part.name: part.results for part in ablations.plan(config)}
+    assert places["plan"] == Path("results/maze30/plan")
+    assert places["ucb"] == Path("results/maze30/ucb")
+    below = Path("results/ablations/maze30/plan")
+    for name in ("without-steering", "without-rehearsal", "without-splicing", "without-frontiers"):
+        assert places[name] == below / name
+        assert f"| {name.replace('-', ' ')} | -23.81 |" in text
+    own = config.folder / "plan" / "without-steering-3seeds"
+    own.mkdir(parents=True)
+    assert {part.name: part.results for part in ablations.plan(config)} == {
+        **places,
+        "without-steering": own,
+    }
+    world, name = envs.find("maze30"), "without-steering"
+    asked = {"without-steering": {"steer": 0}, "other": {"steer": 1}, "more": {"steer": 0, "rehearse": 1}}
+    for label, changes in asked.items():
+        settings = AdaptConfig(
+            env="maze30", method="plan", hyper=methods.find("plan").hyper_in(world, changes)
+        )
+        found = comparisons.published(config, settings, below / name)
+        assert found == (below / name if label == name else None)
+    few = ablations.plan(replace(config, seeds=1, out=tmp_path))
+    assert all(part.results.parent.parent.parent == tmp_path for part in few)
+
+
 def test_table4_has_the_length_of_the_policy_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[Path] = []
     monkeypatch.setattr(ablations, "adapted", lambda *args: asked.extend(args[2]))
@@ -483,9 +519,11 @@ def test_the_inventory_counts_prices_and_doubts(tmp_path: Path) -> None:
     assert rows["table5"][1] == "0 of 4"
     # Four trainings of 2,000 steps at the speed of the released policy, and four times UCB.
     assert 4 * 2_000 * 0.2 / 60 < float(rows["table5"][3]) < 4 * (2_000 * 0.4 + 2 * spent) / 60
-    # Five rows of the ablation are searches by the plan, and one is a search by UCB.
+    # Six rows of the ablation: searches by the plan without a part, and two that are published.
     plan = read_summary(Path("results/maze15/plan"))["cpu_seconds"]
-    assert float(rows["plan"][3]) == pytest.approx((5 * plan + spent) / 60, rel=0.05)
+    assert rows["plan"][1] == "2 of 6"
+    assert float(rows["plan"][3]) == pytest.approx(4 * plan / 60, rel=0.05)
+    assert rows["table4"][1:4:2] == ["7 of 7", ""]
     assert rows["heads"][1] == "-"
     assert "heads is not available for maze15" in rows["heads"][3]
     assert rows["figure11"][1] == "0 of 1"

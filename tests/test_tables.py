@@ -46,6 +46,14 @@ OTHER_SETTINGS = {  # of published results that the paper's number may not stand
     "ablations/maze15/behind-noise/plan-obs": "obs_noise=0.02",
     "ablations/maze15/behind-noise/ucb-action": "action_noise=0.1",
     "ablations/maze15/behind-noise/ucb-obs": "obs_noise=0.02",
+    "ablations/maze30/plan/without-frontiers": "frontier=false",
+    "ablations/maze30/plan/without-rehearsal": "rehearse=0",
+    "ablations/maze30/plan/without-splicing": "splice=false",
+    "ablations/maze30/plan/without-steering": "steer=0",
+    **{f"ablations/maze15/table4/K{k}": f"max_goals={k}" for k in (1, 2, 3)},
+    "ablations/maze15/table4/c0": "max_goals=5, c=0, scale=1",
+    "ablations/maze15/table4/c1": "max_goals=5, scale=1",
+    "ablations/maze15/table4/c10": "max_goals=5, c=10, scale=1",
     **{
         f"ablations/maze15/paper-recipe/{m}": "policy=results/ablations/maze15/paper-recipe/policy"
         for m in ("ucb", "bpe", "explore", "grips", "bbt")

@@ -179,6 +179,15 @@ def changed_settings(
     return {shortened(name): _format_setting(value) for name, value in changed.items()}
 
 
+def changed_hyper(settings: AdaptConfig, world: World | None) -> dict[str, str]:
+    """The hyper-parameters of an adaptation that differ from the method's defaults in a world, as text."""
+    if settings.hyper is None:
+        return {}
+    hyper = {"hyper": dataclasses.asdict(settings.hyper)}
+    changed = _changed_hyper(hyper, settings.method, world)
+    return {shortened(name): _format_setting(value) for name, value in changed.items()}
+
+
 def _released_sha256(world: World | None, kind: str, default: str | None) -> str | None:
     """The hash of a world's released network of a kind; ``default`` if there is none."""
     place = released_folder(world, kind) / CONFIG if world else None
