@@ -423,7 +423,11 @@ def test_published_rows_are_found_and_not_made_again(
         "without-steering": own,
     }
     world, name = envs.find("maze30"), "without-steering"
-    asked = {"without-steering": {"steer": 0}, "other": {"steer": 1}, "more": {"steer": 0, "rehearse": 1}}
+    asked = {
+        "without-steering": {"steer": 0},
+        "other": {"steer": 1},
+        "more": {"steer": 0, "rehearse": 1},
+    }
     for label, changes in asked.items():
         settings = AdaptConfig(
             env="maze30", method="plan", hyper=methods.find("plan").hyper_in(world, changes)
