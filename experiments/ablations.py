@@ -167,7 +167,7 @@ def adapted(
 
 
 def _place(config: ReproduceConfig, name: str, hyper: Any, method: str = "ucb") -> Path:
-    """The results of a row: those of this command if they exist, or published ones of as many seeds.
+    """The folder of a row's results: that of this command if it exists, or published ones of as many seeds.
 
     Args:
       config: settings of the command.
