@@ -129,9 +129,7 @@ def test_the_divergence_of_gaussians_is_that_of_many_draws():
 
 
 @pytest.mark.optimized
-@pytest.mark.parametrize(
-    "config", [OPEN, pytest.param(CLOSED, marks=pytest.mark.slow)], ids=["open", "closed"]
-)
+@pytest.mark.parametrize("config", [OPEN, CLOSED], ids=["open", "closed"])
 def test_four_skills_are_told_apart(config):
     """Windows of four fixed sequences, two possible after each first observation, are given back.
 

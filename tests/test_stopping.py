@@ -36,7 +36,7 @@ def stops(outcome, stop_at):
 
 
 @pytest.mark.optimized
-@pytest.mark.parametrize("env", [MAZE, pytest.param(Point(), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("env", [MAZE, Point()])
 def test_a_search_that_ends_early_is_the_same_until_then(env):
     whole = run(env, None)
     values = np.unique(whole.eval_returns)

@@ -175,8 +175,7 @@ def changed_settings(
     released = _released_sha256(world, policy_kind(method_of(summary)), sha256)
     if "policy" not in changed and sha256 not in (None, released):
         changed["policy"] = sha256[:12] if sha256 else ""
-    changed |= _changed_hyper(config, method_of(summary), world)
-    return {shortened(name): _format_setting(value) for name, value in changed.items()}
+    return _texts(changed | _changed_hyper(config, method_of(summary), world))
 
 
 def changed_hyper(settings: AdaptConfig, world: World | None) -> dict[str, str]:
@@ -184,7 +183,10 @@ def changed_hyper(settings: AdaptConfig, world: World | None) -> dict[str, str]:
     if settings.hyper is None:
         return {}
     hyper = {"hyper": dataclasses.asdict(settings.hyper)}
-    changed = _changed_hyper(hyper, settings.method, world)
+    return _texts(_changed_hyper(hyper, settings.method, world))
+
+
+def _texts(changed: Mapping[str, Any]) -> dict[str, str]:
     return {shortened(name): _format_setting(value) for name, value in changed.items()}
 
 
