@@ -1,1 +1,2 @@
-"""Worlds made from gymnasium environments of other packages; see docs/guides/own-gymnasium-world.md."""
+"""Worlds made from gymnasium environments of other packages (docs/guides/own-gymnasium-world.md), and small
+programs that measure or tabulate what no command does."""

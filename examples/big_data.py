@@ -18,6 +18,7 @@ import numpy as np
 from mgpo_jax.dataset import finish_mapped
 from mgpo_jax.files import new_folder
 from mgpo_jax.growing import GrowingFiles
+from mgpo_jax.memory import peak_bytes
 
 STEPS, PICTURE = 50, (64, 64, 3)
 """Number of steps of each trajectory, and the shape of its pictures of bytes."""
@@ -52,12 +53,6 @@ def write(folder: Path, num: int) -> None:
         finish_mapped(place, files.finish(), num, num * STEPS, {"seed": 0})
 
 
-def peak_megabytes(who: int) -> float:
-    """The largest resident memory so far, of this process or of its children."""
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(who).ru_maxrss * unit / 1e6
-
-
 def main() -> None:
     """Write the data if they are not there, and train on them if a folder for that is given."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -69,13 +64,13 @@ def main() -> None:
     if not config.folder.exists():
         write(config.folder, config.trajectories)
         size = sum(path.stat().st_size for path in config.folder.iterdir()) / 1e9
-        peak = peak_megabytes(resource.RUSAGE_SELF)
+        peak = peak_bytes() / 1e6
         print(f"written: {size:.2f} GB on disk, peak {peak:,.0f} MB")
     if config.run is not None:
         flags = TRAINING.replace("--steps 200", f"--steps {config.steps}").split()
         command = ["-m", "experiments.pretrain", "--data", str(config.folder), *flags]
         subprocess.run([sys.executable, *command, "--out", str(config.run)], check=True)
-        print(f"trained: peak {peak_megabytes(resource.RUSAGE_CHILDREN):,.0f} MB")
+        print(f"trained: peak {peak_bytes(resource.RUSAGE_CHILDREN) / 1e6:,.0f} MB")
 
 
 if __name__ == "__main__":

@@ -36,9 +36,10 @@ def over_time(folder: Path) -> list[str]:
     means = [f"{spread.mean:.2f}" for spread in spreads]
     if spreads[-1].std is not None:
         means[-1] += f" ± {spreads[-1].std:.2f}"
-    means += [""] * (len(EPISODES) - len(known))
+    shown = dict(zip(known, means, strict=True))
+    cells = [shown.get(episode, "") for episode in EPISODES]
     paper = paper_final(row.summary["env"], method) if row.like_the_paper else ""
-    return [f"`{' '.join([method, *flags])}`{one_seed}", *means, paper]
+    return [f"`{' '.join([method, *flags])}`{one_seed}", *cells, paper]
 
 
 def main(folders: Sequence[Path]) -> None:

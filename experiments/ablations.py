@@ -27,6 +27,7 @@ from experiments.store.presets import pretrain_preset
 from experiments.store.provenance import provenance
 from experiments.store.reproduce_settings import TRAIN_NOTHING, ReproduceConfig
 from experiments.store.result_files import load_results
+from experiments.store.rows import PAPER_EPISODES
 from experiments.store.seals import write_sealed
 from experiments.store.settings import DataConfig, PretrainConfig, file_name
 from experiments.store.statistics import SeedSpread
@@ -41,7 +42,7 @@ from mgpo_jax.methods import UCB, UcbHyper
 from mgpo_jax.policy_files import load_policy
 from mgpo_jax.tasks import test_tasks
 
-EPISODES = 100  # episodes of an adaptation
+EPISODES = PAPER_EPISODES  # episodes of an adaptation
 UNFINISHED = "unfinished-"  # prefix of folders with the finished pieces of an unfinished adaptation
 LONGEST = 5  # maximum number of goals in a prompt where the paper varies c
 

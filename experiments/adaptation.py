@@ -204,12 +204,12 @@ def save_outcome(
 
 def _count_idle_episodes(results: Results) -> int:
     """The number of search and evaluation episodes that were not run because a search had stopped early."""
-    used = results.episodes_used
-    if used is None:
+    used, last = results.episodes_used, results.last_judgement
+    if used is None or last is None:
         return 0
     judged = judged_episodes(results.config, results.world)
     assert judged is not None
-    later = (results.eval_episodes > used[..., None]).sum()
+    later = (results.eval_returns.shape[-1] - 1 - last).sum()
     return int((results.returns.shape[-1] - used).sum() + judged * later)
 
 

@@ -39,7 +39,7 @@ class BenchConfig(Joined):
     demonstrator: Annotated[Name | None, tyro.conf.arg(aliases=("--policy",))] = None
     """The demonstrator to collect and train on (default: that of the world's preset)."""
     quick: bool = False
-    """Do a tenth of the work, for rough numbers."""
+    """Do a tenth to a half of the work, depending on the row, for rough numbers."""
     trajectories: Annotated[NumTrajectories | None, tyro.conf.arg(aliases=("--episodes",))] = None
     """Number of trajectories to collect (default: 5,000, or 500 with ``--quick``)."""
     rows: Literal["all", "shared", "step"] = "all"

@@ -101,8 +101,12 @@ def suited(array: np.ndarray, who: str, what: str) -> np.ndarray:
     if array.dtype.kind == "f" and array.dtype.itemsize > 4:
         return array.astype(np.float32)
     if array.dtype.itemsize == 8:
-        if len(array) and not LARGEST_INT.min <= array.min() <= array.max() <= LARGEST_INT.max:
-            raise DataError(f"{who}: {what} hold {int(array.max())}, which needs more than 32 bits")
+        ends = [int(array.min()), int(array.max())] if len(array) else []
+        if large := [end for end in ends if not LARGEST_INT.min <= end <= LARGEST_INT.max]:
+            raise DataError(
+                f"{who}: {what} hold {large[0]}, which needs more than 32 bits; scale or recode them "
+                "before the import"
+            )
         return array.astype(np.int32)
     return array.astype(array.dtype.newbyteorder("="))
 

@@ -95,7 +95,8 @@ class Attempts:
         self.tries.update(indices.tolist())
         if self.tries and (worst := self.tries.most_common(1)[0])[1] >= MAX_TRIES:
             raise DataError(
-                f"the demonstrator failed {MAX_TRIES} times at task {worst[0]} of {self.name}"
+                f"the demonstrator failed {MAX_TRIES} times at task {worst[0]} of {self.name}; check that "
+                "it can solve this task, or leave such tasks out of sample_task"
             )
         self.num_again += len(indices)
 
@@ -217,5 +218,6 @@ def recorded_batches(
         if fruitless >= MAX_TRIES:
             raise DataError(
                 f"nothing to keep in {MAX_TRIES * BATCH} attempts: nearly every task of "
-                f"{env.spec.name} is a test task or its demonstrations are dropped"
+                f"{env.spec.name} is a test task or its demonstrations are dropped; lower num_test_tasks, "
+                "or let the demonstrator keep more"
             )

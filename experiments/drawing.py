@@ -154,11 +154,16 @@ def check_together(folders: Mapping[Path, Results], tasks: Sequence[int], seed: 
                 f"{folder} and {first_folder} ran on different tasks; plot them one at a time"
             )
         if not 0 <= seed < len(result.returns):
-            raise UsageError(f"--seed {seed}: {folder} has {len(result.returns)} seeds")
+            raise UsageError(
+                f"--seed {seed} must be from 0 to {len(result.returns) - 1}, the seeds in {folder}; "
+                "choose another"
+            )
     num = first.returns.shape[1]
     for index in tasks:
         if not 0 <= index < num:
-            raise UsageError(f"--tasks {index}: {first.env} has the tasks 0 to {num - 1}")
+            raise UsageError(
+                f"--tasks {index} must be from 0 to {num - 1}, the tasks of {first_folder}; choose others"
+            )
 
 
 def write(path: Path, save: Save) -> None:

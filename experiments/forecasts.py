@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Sequence
-from math import ceil
 from typing import Any, NamedTuple
 
 import jax
@@ -19,11 +18,10 @@ from experiments.inventory import price_of, seconds_per_episode
 from experiments.networks import sized_network
 from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.settings import PretrainConfig
-from experiments.store.summary import judged_episodes
+from experiments.store.speeds import num_judging
 from experiments.store.tables import block
 from mgpo_jax import methods
 from mgpo_jax.dataset import spec_of
-from mgpo_jax.files import to_json
 from mgpo_jax.kinds import MULTI_GOAL
 from mgpo_jax.losses import initial_params
 from mgpo_jax.manifest import read_facts
@@ -61,11 +59,9 @@ def of_adaptation(
     """
     num, method = num_tasks(tasks), methods.find(config.method)
     lanes = num * config.seeds * _num_variants(config)
-    judgements = 1 + ceil(config.episodes / config.eval_every)
-    judged = judgements * (judged_episodes(to_json(config), world) or 1)
     rate = seconds_per_episode(config.env, method)
     num_bytes = log_bytes(env, lanes, config.episodes, config.keep_actions)
-    searching, judging = lanes * config.episodes, lanes * judged
+    searching, judging = lanes * config.episodes, lanes * num_judging(config, world)
     steps, weights = (searching + judging) * env.spec.horizon, _num_weights(policy.params)
     searches = f"{num} tasks x {config.seeds} seeds x {_num_variants(config)} variants"
     facts = [

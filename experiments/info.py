@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import platform
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from experiments.runtime import Common, cache_folder, run, say
 from experiments.store.provenance import provenance, versions_of
 from experiments.store.settings import data_root
 from experiments.store.tables import block
+from mgpo_jax.memory import physical_bytes
 
 FURTHER = ("orbax-checkpoint", "gymnasium", "minari")
 """Packages on which no result depends, but checkpoints, worlds and logs of others do."""
@@ -42,7 +42,7 @@ def gathered() -> dict[str, Any]:
         "backend": jax.default_backend(),
         "devices": made["devices"],
         "cpu_count": made["cpu_count"],
-        "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
+        "memory_bytes": physical_bytes(),
         "extras": {extra.name: list(extra.missing) for extra in extras()},
         "folders": {
             name: {"place": str(place.absolute()), "bytes": size_of(place)}

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import platform
-import resource
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from typing import Any
@@ -29,6 +27,7 @@ from experiments.store.settings import PretrainConfig
 from mgpo_jax import methods, processes
 from mgpo_jax.dataset import BatchPlan, Dataset
 from mgpo_jax.lanes import cache_bytes, lanes_together, together
+from mgpo_jax.memory import peak_bytes
 from mgpo_jax.network_configs import TransformerConfig
 from mgpo_jax.policy import LoadedPolicy
 from mgpo_jax.policy_files import load_policy
@@ -67,7 +66,7 @@ def measurements(
       env_name: name of the world.
       demonstrator: the demonstrator to collect with (default: that of the world's preset).
       num_trajectories: number of trajectories to collect.
-      quick: whether to do about a tenth of the work.
+      quick: whether to do less of the work, a tenth to a half depending on the row.
       rows: ``all``, ``shared`` (those whose work several processes share) or ``step`` (those up to the
         gradient step).
     """
@@ -197,9 +196,7 @@ def _step_rows(
     yield Row("  matrix product", rate, "GFLOP / CPU-s", "2048 x 2048, same run, before and after")
     yield Row("  relative speed", 100 * flops / cpu / 1e9 / rate, "%", "of the matrix product")
     yield Row("  padding", 100 * (1 - lengths.sum() / padded), "%", "of the steps computed")
-    unit = 1e9 if platform.system() == "Darwin" else 1e6  # bytes on macOS, kilobytes elsewhere
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
-    yield Row("  peak memory", peak, "GB", "of the whole process so far")
+    yield Row("  peak memory", peak_bytes() / 1e9, "GB", "of the whole process so far")
 
 
 def policy_to_bench(
@@ -290,7 +287,10 @@ def bench_adaptation(
     """Measure an adaptation with UCB to the world's test tasks."""
     num = world.num_test_tasks
     tasks = benchmark_tasks(env, num)
-    outcome = adapt(env, policy, tasks, "ucb", seeds=3, episodes=episodes, judged=world.judged)
+    hyper = methods.find("ucb").hyper_in(world)
+    outcome = adapt(
+        env, policy, tasks, "ucb", hyper, seeds=3, episodes=episodes, judged=world.judged
+    )
     note = f"{note}, {num} tasks x 3 seeds x {episodes} episodes"
     return Row("adaptation", outcome.num_episodes / outcome.cpu_seconds, "episodes / CPU-s", note)
 
@@ -304,6 +304,7 @@ def bench_baselines(
     episodes are counted. A baseline that cannot be used in the world has no row.
     """
     tasks = benchmark_tasks(env, NUM_BASELINE_TASKS)
+    judged = replace(world.judged, episodes=1)
     for name in BASELINES:
         method = methods.find(name)
         try:
@@ -311,7 +312,7 @@ def bench_baselines(
             policy, note = policy_to_bench(world, env, recipe, dataset)
             outcome = adapt(
                 env, policy, tasks, method, method.hyper_in(world),
-                seeds=1, episodes=episodes, eval_every=episodes,
+                seeds=1, episodes=episodes, eval_every=episodes, judged=judged,
             )  # fmt: skip
         except UsageError:
             continue

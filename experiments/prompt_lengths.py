@@ -111,7 +111,8 @@ def by_length(results: Results, seed: int = 0, num_draws: int = DRAWS) -> list[L
     slots = policy.config.max_prompt_length
     lengths = np.arange(1, slots + 1)
     reached = best_goals(results)
-    key, goals = jax.random.key(seed), jnp.asarray(results.task_goals)
+    # Other random numbers than those of the episodes, which ``uncertainty`` draws from ``seed``.
+    key, goals = jax.random.fold_in(jax.random.key(seed), 1), jnp.asarray(results.task_goals)
     prompts = draw_prompts(key, reached, goals, slots, jnp.asarray(lengths), num_draws)
     shape = prompts.mask.shape[:-1]  # [L, D, S, N]
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[3:]), prompts)

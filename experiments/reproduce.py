@@ -4,8 +4,9 @@ Tables 1, 2 and 8 compare methods in several worlds: missing cells are adapted o
 is not available is a dash, with the reason below the table. Table 3 evaluates the same adaptations under
 noise. An ablation is made for one world at a time: it runs or continues the trainings that are missing,
 adapts with UCB, prints the table and draws the learning curves. All its trainings have the same budget,
-which is smaller than that of the released policies and is stated above the table. The ablation ``plan``
-trains nothing and adapts with our own optimizer, each time without one of its parts. ``all`` makes
+which is smaller than that of the released policies and is stated above the table. Two ablations train
+nothing and use the released policy: ``table4`` adapts with UCB, and ``plan`` with our own optimizer, each
+time without one of its parts. ``all`` makes
 everything that is missing, and ``list`` shows what that is.
 """
 

@@ -11,10 +11,11 @@ import numpy as np
 
 import envs
 from envs.base import Environment
-from envs.errors import DataError, UsageError
+from envs.errors import DataError
 from envs.registry import World
 from experiments.datasets import collect_and_save
 from experiments.demonstrators import find_demonstrator
+from experiments.store.presets import check_holdout
 from experiments.store.settings import CollectConfig, PretrainConfig, dataset_folder
 from experiments.store.work import PIECES
 from mgpo_jax import processes
@@ -115,8 +116,5 @@ def prepare_dataset(
             f"has {settings or 'none'}; remove it, and it is collected again"
         )
     refuse_test_tasks(dataset, env, world, folder, "remove it and collect it again")
-    if config.holdout >= len(dataset):
-        raise UsageError(
-            f"--holdout {config.holdout} leaves nothing of {len(dataset)} trajectories"
-        )
+    check_holdout(config.holdout, len(dataset))
     return dataset, folder, manifest["sha256"]

@@ -156,7 +156,8 @@ def whole_rounds(adapter: Adapter, num_episodes: int) -> int:
     rounds, rest = divmod(num_episodes, adapter.episodes_per_round)
     if rest or not rounds:
         raise ValueError(
-            f"{num_episodes} episodes are not a whole number of rounds of {adapter.episodes_per_round}"
+            f"{num_episodes} episodes are not a whole number of rounds; give a multiple of "
+            f"{adapter.episodes_per_round}"
         )
     return rounds
 

@@ -23,6 +23,7 @@ from mgpo_jax.lanes import Grid, Lanes, Layout, cache_bytes, lay_out, over_lanes
 from mgpo_jax.network_configs import TransformerConfig
 from mgpo_jax.policy import LoadedPolicy, check_fits, transformer_policy
 from mgpo_jax.rollout import Query, rollout
+from mgpo_jax.settings import check_positive
 from mgpo_jax.sharding import fetch, replicate, split
 from mgpo_jax.tasks import num_tasks
 from mgpo_jax.transformer import GoalTransformer
@@ -43,7 +44,7 @@ def evaluate(
     those of ``evaluate_fully``, which returns more.
 
     Raises:
-      UsageError: if the queries are not for as many tasks.
+      UsageError: for no episodes, or if the queries are not for as many tasks.
       DataError: if the policy was trained for another world, or a return is not finite.
     """
     judged = evaluate_fully(env, policy, tasks, queries, episodes=episodes, seed=seed)
@@ -74,9 +75,10 @@ def evaluate_fully(
       ``achieved`` [S, N, M].
 
     Raises:
-      UsageError: if the queries are not for as many tasks.
+      UsageError: for no episodes, or if the queries are not for as many tasks.
       DataError: if the policy was trained for another world, or a return is not finite.
     """
+    check_positive(episodes=episodes)
     run = partial(_measurement, num_episodes=episodes)
     return _run_queries(run, env, policy, tasks, queries, seed)
 
@@ -158,7 +160,7 @@ def _run_queries(
     grid = Grid(variants=1, seeds=seeds, tasks=num)
     layout = lay_out(env, grid.size, cache_bytes(policy.config))
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), queries)
-    index = np.arange(layout.num_lanes) % grid.size
+    index = grid.padded(layout)
     own = (
         grid.lanes(layout, tasks, seed, {}),
         jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], flat),

@@ -94,6 +94,14 @@ class Grid:
             stopped=jnp.zeros(layout.num_lanes, bool) if ends_early else None,
         )
 
+    def padded(self, layout: Layout) -> np.ndarray:
+        """The lane of the grid whose inputs each lane of the layout has."""
+        return np.arange(layout.num_lanes) % self.size
+
+    def place(self, lane: int) -> tuple[int, int]:
+        """The seed number and the task of a lane."""
+        return divmod(int(lane) % (self.seeds * self.tasks), self.tasks)
+
     def shape(self, rows: np.ndarray) -> np.ndarray:
         """Reshape rows of lanes to ``[variants, S, N, ..]``, without the lanes that only pad groups."""
         return rows[: self.size].reshape(self.variants, self.seeds, self.tasks, *rows.shape[1:])

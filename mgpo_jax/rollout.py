@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from envs.agents import Agent
 from envs.base import Environment, Episode, State, Task, TimeStep
 from envs.episodes import run_episode
+from envs.registry import Judgement
 from mgpo_jax.policy import Policy
 from mgpo_jax.prompts import Prompt
 
@@ -40,6 +41,12 @@ def act(
     """An action from a distribution: its mode if ``greedy``, otherwise a random one."""
     explored = distribution if temperature is None else distribution.tempered(temperature)
     return jnp.where(greedy, distribution.mode(), explored.explore(key))
+
+
+def acting_as(judged: Judgement) -> tuple[Bool[Array, ""], Float[Array, ""] | None]:
+    """How a policy acts when it is judged: whether greedily, and at what temperature (None: its own)."""
+    temperature = jnp.float32(judged.temperature) if judged.tempered else None
+    return jnp.asarray(judged.mode == "greedy"), temperature
 
 
 def prompted(policy: Policy, query: Query) -> Agent:

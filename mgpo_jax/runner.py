@@ -7,7 +7,6 @@ A run is divided into segments of rounds, each followed by a judgement of the be
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -22,11 +21,13 @@ from envs.registry import find as find_world
 from mgpo_jax.adaptation import Adapter
 from mgpo_jax.journal import Journal
 from mgpo_jax.lanes import Grid, lay_out
+from mgpo_jax.memory import physical_bytes
 from mgpo_jax.methods import Method, Setting, find, split_hyper
 from mgpo_jax.outcomes import Outcome
 from mgpo_jax.policy import LoadedPolicy, check_fits
 from mgpo_jax.programs import programs_of
 from mgpo_jax.segments import Run, longest_part, run_segments
+from mgpo_jax.settings import check_positive
 from mgpo_jax.sharding import replicate, split
 from mgpo_jax.tasks import num_tasks
 
@@ -62,8 +63,13 @@ def adapt(
         without a record, one greedy episode).
       keep_actions: whether to keep continuous actions; discrete ones are always kept.
 
+    Returns:
+      The judged returns, the episodes of the searches, and what the method held best after each round.
+
     Raises:
-      UsageError: if the method cannot be used in this setting.
+      UsageError: for a number below 1, no tasks, results that exceed the memory, or a method that cannot be
+        used in this setting.
+      DataError: if the policy was trained for another world, or a return is not finite.
     """
     method = find(method) if isinstance(method, str) else method
     if isinstance(world, str):
@@ -75,18 +81,9 @@ def adapt(
     else:
         env = world
     (outcome,) = sweep(
-        env,
-        policy,
-        tasks,
-        method,
-        [hyper],
-        seeds=seeds,
-        episodes=episodes,
-        seed=seed,
-        eval_every=eval_every,
-        judged=judged,
-        keep_actions=keep_actions,
-    )
+        env, policy, tasks, method, [hyper], seeds=seeds, episodes=episodes, seed=seed,
+        eval_every=eval_every, judged=judged, keep_actions=keep_actions,
+    )  # fmt: skip
     return outcome
 
 
@@ -130,7 +127,7 @@ def sweep(
       UsageError: for a number below 1, no tasks, results that exceed the memory, or an unsuitable method.
       DataError: if the policy was trained for another world, or a return is not finite.
     """
-    _check_positive(seeds=seeds, episodes=episodes, eval_every=eval_every)
+    check_positive(seeds=seeds, episodes=episodes, eval_every=eval_every)
     setting = _checked_setting(env, policy, method, hypers, episodes, judged)
     fixed, numbers = split_hyper(hypers)
     adapter = method.adapter(setting, policy.params, hypers[0])
@@ -168,19 +165,12 @@ def _checked_setting(
     return setting
 
 
-def _check_positive(**numbers: int) -> None:
-    """Raise ``UsageError`` for the first number that is below 1."""
-    for name, value in numbers.items():
-        if value < 1:
-            raise UsageError(f"{name} must be at least 1, found {value}")
-
-
 def _check_room(env: Environment, grid: Grid, episodes: int, keep_actions: bool) -> None:
     """Raise ``UsageError`` if there are no tasks, or if the log would not fit into memory."""
     if not grid.size:
         raise UsageError("there are no tasks to adapt to")
     needed = log_bytes(env, grid.size, episodes, keep_actions)
-    room = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    room = physical_bytes()
     if needed > room:
         raise UsageError(
             f"{grid.size:,} adaptations of {episodes:,} episodes need {needed / 1e9:,.0f} GB of memory, "

@@ -35,7 +35,8 @@ from mgpo_jax.trees import numbered_leaves, with_leaves
 PART_SECONDS = 30.0
 """The wall time, in seconds, that a part should take; one round may take longer."""
 MIN_ROOM, LOG_BYTES = 10, 1 << 28
-"""The log of a part, on the devices, has room for so many rounds, or for as many as need so many bytes."""
+"""The log of a part has room on the devices for at least ``MIN_ROOM`` rounds, and for more as long as they
+take at most ``LOG_BYTES`` bytes."""
 SAVING_SHARE = 0.05
 """The largest share of the time that saving may take within a segment. At its end everything is saved,
 however long that takes."""
@@ -60,7 +61,7 @@ class Run(NamedTuple):
 
     def without(self, stopped: np.ndarray) -> Lanes:
         """The lanes with the given ones marked as ended; lanes that pad the grid repeat its first ones."""
-        index = np.arange(self.layout.num_lanes) % self.grid.size
+        index = self.grid.padded(self.layout)
         return self.lanes._replace(stopped=split(self.layout.mesh, jnp.asarray(stopped[index])))
 
 
@@ -169,7 +170,7 @@ def _check_finite(log: AdaptLog, judged: Judged, grid: Grid, rounds_before: int)
         value, what = judged.return_[lane], "an evaluation episode"
     else:
         return
-    seed, task = divmod(int(lane) % (grid.seeds * grid.tasks), grid.tasks)
+    seed, task = grid.place(lane)
     raise DataError(
         f"the return of {what} on task {task} with seed number {seed} is {value}; {CHECK_RETURNS}"
     )
@@ -201,7 +202,7 @@ def _check_sound(searches: Any, run: Run, rounds: int) -> None:
     """Raise ``DataError`` for the first search whose state holds NaN, such as weights that diverged."""
     grid = run.grid
     if (broken := _has_nan(searches, run.layout.mesh)[: grid.size]).any():
-        seed, task = divmod(int(np.argmax(broken)) % (grid.seeds * grid.tasks), grid.tasks)
+        seed, task = grid.place(int(np.argmax(broken)))
         raise DataError(
             f"the search on task {task} with seed number {seed} has diverged: what it learned holds NaN "
             f"after {rounds} rounds; lower its learning rate"
@@ -236,33 +237,39 @@ def _resumed(
 ) -> tuple[list[Part], Any]:
     """The finished parts in a journal, and the state after them.
 
-    If any part is missing, the run starts again: no parts are returned, with the initial ``state``.
+    If a part is missing or of another form, the run starts again: no parts are returned, with the initial
+    ``state``.
     """
     saved = journal.read("state")
     if saved is None:
-        if journal.read("part000000") is not None and processes.is_first():
-            print("the saved state of the adaptation is lost: it starts again", file=sys.stderr)
-        return [], state
+        lost = journal.read("part000000") is not None
+        return _anew("the saved state of the adaptation is lost" if lost else None, state)
     num_parts = int(saved.pop("parts", 0))  # older versions saved whole segments
     records = [journal.read(f"part{i:06}") for i in range(num_parts)]
     log, judged = jax.tree.map(lambda leaf: 0, shapes)
     like = Part(log, judged, ends_segment=False, cpu_seconds=0.0)
-    done = [with_leaves(like, record) for record in records if record is not None]
-    if not num_parts or len(done) < num_parts:
-        if processes.is_first():
-            print(
-                "the saved part of the adaptation is incomplete: it starts again", file=sys.stderr
-            )
-        return [], state
-    # The lanes that pad the grid repeat its first ones.
-    index = np.arange(run.layout.num_lanes) % run.grid.size
+    found = [record for record in records if record is not None]
+    if not num_parts or len(found) < num_parts:
+        return _anew("the saved part of the adaptation is incomplete", state)
+    try:
+        done, kept = [with_leaves(like, record) for record in found], with_leaves(state, saved)
+    except ValueError:
+        return _anew("the saved part of the adaptation was written by another version", state)
+    index = run.grid.padded(run.layout)
 
     def placed(rows: Any, like: Any) -> Any:
         rows = jnp.asarray(rows[index])
         return jax.random.wrap_key_data(rows) if is_key(like) else rows
 
-    state = split(run.layout.mesh, jax.tree.map(placed, with_leaves(state, saved), state))
+    state = split(run.layout.mesh, jax.tree.map(placed, kept, state))
     return [
         part._replace(ends_segment=bool(part.ends_segment), cpu_seconds=float(part.cpu_seconds))
         for part in done
     ], state
+
+
+def _anew(why: str | None, state: Any) -> tuple[list[Part], Any]:
+    """No parts and the initial state, after a word on why what was saved cannot be used."""
+    if why is not None and processes.is_first():
+        print(f"{why}: it starts again", file=sys.stderr)
+    return [], state

@@ -103,6 +103,13 @@ def check_settings(settings: Any) -> None:
             check_settings(value)
 
 
+def check_positive(**numbers: int) -> None:
+    """Raise ``UsageError`` for the first number that is below 1."""
+    for name, value in numbers.items():
+        if value < 1:
+            raise UsageError(f"{name} must be at least 1, found {value}")
+
+
 def check_values(settings_class: type, values: Mapping[str, Any]) -> None:
     """Raise ``UsageError`` for the first value that is not allowed for a field of a settings dataclass.
 

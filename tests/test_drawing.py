@@ -275,10 +275,10 @@ def test_command_refuses_what_it_cannot_draw(tmp_path: Path, save: Save, policy:
     for config, message in (
         (PlotConfig(), "no result folder given"),
         (PlotConfig(runs=(run, elsewhere)), "different tasks"),
-        (PlotConfig(runs=(run,), seed=2), "--seed 2: .* has 2 seeds"),
-        (PlotConfig(runs=(run,), seed=-1), "--seed -1: .* has 2 seeds"),
-        (PlotConfig(runs=(run,), tasks=(7,)), "tasks 0 to 1"),
-        (PlotConfig(runs=(run,), tasks=(-1,)), "tasks 0 to 1"),
+        (PlotConfig(runs=(run,), seed=2), "--seed 2 must be from 0 to 1"),
+        (PlotConfig(runs=(run,), seed=-1), "--seed -1 must be from 0 to 1"),
+        (PlotConfig(runs=(run,), tasks=(7,)), "must be from 0 to 1, the tasks of"),
+        (PlotConfig(runs=(run,), tasks=(-1,)), "must be from 0 to 1, the tasks of"),
     ):
         with pytest.raises(UsageError, match=message):
             main(replace(config, out=tmp_path / "out"))

@@ -200,6 +200,17 @@ def test_mixtures_have_no_divergence_and_are_refused() -> None:
         method.check_use(SETTING, method.hyper())
 
 
+def test_a_budget_that_never_trains_the_policy_is_refused() -> None:
+    """In the first round of the careful form, only the value head learns."""
+    one_round = replace(SETTING, num_episodes=5)
+    careful = methods.find("ppo-careful")
+    with pytest.raises(UsageError, match=r"5 episodes are spent before .*lower --value-rounds"):
+        careful.check_use(one_round, careful.hyper())
+    careful.check_use(one_round, careful.hyper(value_rounds=0))
+    for name in ("ppo", "reinforce", "reinforce-careful"):
+        methods.find(name).check_use(one_round, methods.find(name).hyper())
+
+
 @pytest.mark.parametrize("tune", ["all", "head", "lora"])
 def test_a_part_starts_as_the_network_that_it_is_of(params: Any, tune: str) -> None:
     part = subset(tune, params, rank=2)

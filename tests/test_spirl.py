@@ -405,6 +405,6 @@ def test_lanes_side_by_side_equal_lanes_alone(config):
 
 def test_a_budget_of_warm_up_alone_is_refused():
     with pytest.raises(
-        UsageError, match=r"10 episodes end before the first update.*--warmup-episodes 10"
+        UsageError, match=r"10 episodes leave none after the first update.*--warmup-episodes 10"
     ):
         methods.find("spirl").check_use(replace(SETTING, num_episodes=10), SpirlHyper())

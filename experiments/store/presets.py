@@ -154,10 +154,15 @@ def check_pretraining(config: PretrainConfig) -> None:
         raise UsageError(
             f"--embed-dim {config.embed_dim} is not a multiple of --num-heads {config.num_heads}"
         )
-    if config.holdout >= trajectories:
+    check_holdout(config.holdout, trajectories)
+
+
+def check_holdout(holdout: int, trajectories: int) -> None:
+    """Raise ``UsageError`` if the trajectories kept out of training leave none to train on."""
+    if holdout >= trajectories:
         raise UsageError(
-            f"--holdout {config.holdout} leaves nothing of {trajectories} trajectories to train on; "
-            "lower it, or raise --trajectories"
+            f"--holdout {holdout} leaves nothing of {trajectories} trajectories to train on; lower it, or "
+            "raise --trajectories"
         )
 
 

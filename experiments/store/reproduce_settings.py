@@ -35,8 +35,8 @@ class ReproduceConfig(Joined):
     """Scale of comparisons and of drawn adaptations: cpu uses the released networks and the paper's budget;
     smoke five tasks, one seed and 20 episodes; paper networks trained with the preset "paper"."""
     only: tuple[Name, ...] = ()
-    """Names of the datasets (table5), prompt lengths (figure8) or heads to train, or of the methods to
-    compare (default: all)."""
+    """Names of the datasets (table5), prompt lengths (figure8) or heads to train, of the variants of our
+    optimizer (plan, such as "without steering"), or of the methods to compare (default: all)."""
     steps: Count | None = None
     """Gradient steps of each training (default: from the world's preset "ablation")."""
     trajectories: Annotated[NumTrajectories | None, tyro.conf.arg(aliases=("--episodes",))] = None

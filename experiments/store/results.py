@@ -118,17 +118,25 @@ class Results:
         return jax.tree.map(np.asarray, task_at(self.task_set, index))
 
     @property
-    def episodes_used(self) -> np.ndarray | None:
-        """[S, N] episodes that each search used; None without ``--stop-at``.
+    def last_judgement(self) -> np.ndarray | None:
+        """[S, N] index of the judgement at which each search ended; None without ``--stop-at``.
 
-        A search ends after the first judgement that reaches ``--stop-at``, or when its budget is spent.
+        That is the first one that reaches ``--stop-at``, or that after the whole budget.
         """
         stop_at = self.config.get("stop_at")
         if stop_at is None:
             return None
         enough = self.eval_returns >= stop_at
-        last = np.where(enough.any(axis=-1), enough.argmax(axis=-1), enough.shape[-1] - 1)
-        return self.eval_episodes[last]
+        return np.where(enough.any(axis=-1), enough.argmax(axis=-1), enough.shape[-1] - 1)
+
+    @property
+    def episodes_used(self) -> np.ndarray | None:
+        """[S, N] episodes that each search used; None without ``--stop-at``.
+
+        A search whose initial choice is judged good enough uses none.
+        """
+        last = self.last_judgement
+        return None if last is None else np.where(last == 0, 0, self.eval_episodes[last])
 
     def best_goals(self, seed: int, task: int, episodes: int | None = None) -> np.ndarray | None:
         """The goals [k, G] of the best prompt after some number of episodes (default: all of them).

@@ -17,9 +17,9 @@ from experiments.store.adapt_settings import AdaptConfig
 from experiments.store.layout import META
 from experiments.store.provenance import read_meta
 from experiments.store.settings import file_name
-from experiments.store.summary import ADAPT_AGAIN, read_summary
+from experiments.store.summary import ADAPT_AGAIN, judged_episodes, read_summary
 from mgpo_jax import methods
-from mgpo_jax.files import write_json
+from mgpo_jax.files import to_json, write_json
 from mgpo_jax.methods import Method
 
 SPEEDS = Path(__file__).parent / "speeds.json"
@@ -69,10 +69,15 @@ def way_of(method: Method) -> tuple[str, type]:
     return method.policy, method.hyper.__mro__[-2]  # the last class is object
 
 
+def num_judging(config: AdaptConfig, world: World) -> int:
+    """The number of episodes that judge one search, of its initial choice and after every segment."""
+    judgements = 1 + ceil(config.episodes / config.eval_every)
+    return judgements * (judged_episodes(to_json(config), world) or 1)
+
+
 def num_episodes(config: AdaptConfig, world: World, tasks: int) -> int:
     """The number of episodes of an adaptation, those that judge it included."""
-    judgements = 1 + ceil(config.episodes / config.eval_every)
-    return config.seeds * tasks * (config.episodes + judgements * world.judged.episodes)
+    return config.seeds * tasks * (config.episodes + num_judging(config, world))
 
 
 def usual_cost(world: World) -> float | None:

@@ -98,7 +98,7 @@ def printed(summary: Mapping[str, Any]) -> str:
                 f"{unsolvable} of {summary['num_tasks']} (never within the horizon)",
             )
         )
-    if used := summary.get("episodes_used"):
+    if (used := summary.get("episodes_used")) is not None:
         saved = 100 * (1 - used / summary["num_episodes"])
         rows.append(
             ("episodes used", f"{used:.1f} in a search ({saved:.0f} % of the budget saved)")

@@ -30,7 +30,7 @@ from mgpo_jax.kinds import MULTI_GOAL, Learned
 from mgpo_jax.losses import Stats, blurred, stats_of, transformer_told
 from mgpo_jax.network_configs import TransformerConfig
 from mgpo_jax.prompts import Prompt
-from mgpo_jax.rollout import act
+from mgpo_jax.rollout import act, acting_as
 from mgpo_jax.schema import STRICT
 from mgpo_jax.settings import Count, Share
 from mgpo_jax.transformer import GoalTransformer, KVCache, grow_cache
@@ -241,7 +241,7 @@ def low_level(config: CommandConfig, params: Any, judged: Judgement) -> LowLevel
     """
     network: Any = CommandedTransformer(config)
     params = config.prepared(params)
-    temperature = jnp.float32(judged.temperature) if judged.tempered else None
+    greedy, temperature = acting_as(judged)
 
     def view(obs: Array, features: Array) -> View:
         return View(network.apply(params, obs, method="embedded"), features)
@@ -261,7 +261,7 @@ def low_level(config: CommandConfig, params: Any, judged: Judgement) -> LowLevel
     def act_on(key: PRNGKeyArray, cache: KVCache, goal: Array, index: Int[Array, ""]) -> Array:
         del index
         distribution = network.apply(params, cache, goal, method="command")
-        return act(key, distribution, jnp.asarray(judged.mode == "greedy"), temperature)
+        return act(key, distribution, greedy, temperature)
 
     def grow(cache: KVCache, num_steps: int) -> KVCache:
         return grow_cache(cache, config.tokens_per_step * num_steps)

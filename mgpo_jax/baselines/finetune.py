@@ -317,10 +317,19 @@ def make_ppo(setting: Setting, params: Any, hyper: PpoHyper) -> Adapter:
 
 
 def check_finetune(setting: Setting, hyper: FinetuneHyper) -> None:
-    """Raise ``UsageError`` if the policy's exploratory actions are not samples of its distribution."""
-    del hyper
+    """Raise ``UsageError`` if the policy cannot be trained by policy gradients, or no round trains it.
+
+    The exploratory actions of the policy must be samples of its distribution.
+    """
     if setting.network.head == "mixture":
         raise UsageError(
             "a policy gradient needs actions that are samples of the policy, and a mixture explores "
             "without the noise of its components; pre-train with --head binned or --head gaussian"
+        )
+    held = hyper.value_rounds if isinstance(hyper, PpoHyper) else 0
+    if setting.num_episodes <= held * hyper.round_episodes:
+        raise UsageError(
+            f"{setting.num_episodes} episodes are spent before the policy is trained: in the first {held} "
+            f"rounds of {hyper.round_episodes} episodes only the value head learns; raise --episodes, or "
+            "lower --value-rounds"
         )

@@ -72,7 +72,8 @@ class ClipHyper:
     """Weight of the value loss, the squared error of the values."""
 
 
-# The first base that is named has the last fields.
+# A dataclass takes the fields of its last base first, so those of FinetuneHyper come before those of
+# ClipHyper.
 @dataclass(frozen=True)
 class PpoHyper(ClipHyper, FinetuneHyper):
     """Hyper-parameters of PPO. Beyond Table 7 the paper gives none; the defaults are customary values."""
@@ -143,8 +144,8 @@ class PtgmGoalHyper(PtgmHyper):
 class PtgmPpoHyper(ClipHyper, HighLevelHyper):
     """Hyper-parameters of PTGM by PPO over clusters of goals.
 
-    Those that Table 10 gives are of Table 10, all others but the size of a round of PTGM's own code
-    (PKU-RL/PTGM).
+    Values that Table 10 gives are those of Table 10. All others are those of PTGM's own code
+    (PKU-RL/PTGM), except for the size of a round.
     """
 
     clusters: Annotated[int, Ge(1), Le(65_536)] | None = static(None)
@@ -177,8 +178,8 @@ class SpirlHyper:
     alpha: Positive = 1.0
     """Initial weight of the divergence, which is then learned."""
     warmup_episodes: Annotated[int, Ge(0), Le(100_000)] = 10
-    """Number of episodes before the first update, in which the prior acts; they count against the
-    budget."""
+    """Number of episodes after which updates begin, in all of which the prior acts (0 means the same as
+    1); they count against the budget."""
     judged_by: Literal["mean", "sample"] = static("mean")
     """How latents are chosen when the policy is judged: the mean of its distribution, or a sample, as
     in the episodes of the search and in ``spirl-prior``."""

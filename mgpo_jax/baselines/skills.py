@@ -33,7 +33,7 @@ from mgpo_jax.distributions import HEADS, Distribution
 from mgpo_jax.kinds import Learned
 from mgpo_jax.losses import Stats, blurred, stats_of
 from mgpo_jax.network_configs import NetworkConfig
-from mgpo_jax.rollout import act
+from mgpo_jax.rollout import act, acting_as
 from mgpo_jax.schema import STRICT
 from mgpo_jax.settings import NotNegative, NumLayers, Width
 
@@ -230,7 +230,7 @@ def low_level(config: SkillConfig, params: Any, judged: Judgement) -> LowLevel:
     """
     network: Any = SkillNetwork(config)
     params = config.prepared(params)
-    temperature = jnp.float32(judged.temperature) if judged.tempered else None
+    greedy, temperature = acting_as(judged)
 
     def see(obs: Array) -> tuple[Array, Carry]:
         seen = network.apply(params, obs, method="embedded")
@@ -249,7 +249,7 @@ def low_level(config: SkillConfig, params: Any, judged: Judgement) -> LowLevel:
         closed = config.loop == "closed"
         rows, at = (decoded(carry.seen, orders, 1), 0) if closed else (orders, index)
         distribution = jax.tree.map(lambda leaf: leaf[at], rows)
-        return act(key, distribution, jnp.asarray(judged.mode == "greedy"), temperature)
+        return act(key, distribution, greedy, temperature)
 
     return LowLevel(
         begin=see,

@@ -214,9 +214,9 @@ def make_prior(setting: Setting, params: Any, hyper: NoHyper) -> Adapter:
 
 
 def check_spirl(setting: Setting, hyper: SpirlHyper) -> None:
-    """Raise ``UsageError`` if the budget is too small for a single update of the high level."""
+    """Raise ``UsageError`` if the budget leaves no episode after the first update of the high level."""
     if setting.num_episodes <= hyper.warmup_episodes:
         raise UsageError(
-            f"{setting.num_episodes} episodes end before the first update, which follows "
+            f"{setting.num_episodes} episodes leave none after the first update, which follows "
             f"--warmup-episodes {hyper.warmup_episodes}; raise --episodes, or lower --warmup-episodes"
         )

@@ -31,7 +31,7 @@ from mgpo_jax.optimizers.grips import grips
 from mgpo_jax.optimizers.ucb import ucb
 from mgpo_jax.policy import Policy, transformer_policy
 from mgpo_jax.prompts import Prompt, single_goal
-from mgpo_jax.rollout import Query, prompted
+from mgpo_jax.rollout import Query, acting_as, prompted
 
 
 def prompt_adapter(
@@ -73,9 +73,8 @@ def prompt_adapter(
 
 def judged_query(prompt: Prompt, judged: Judgement) -> Query:
     """The query that judges a prompt."""
-    temperature = jnp.float32(judged.temperature) if judged.tempered else None
-    greedy = jnp.full(prompt.mask.shape[:-1], judged.mode == "greedy")
-    return Query(prompt, greedy, temperature)
+    greedy, temperature = acting_as(judged)
+    return Query(prompt, jnp.full(prompt.mask.shape[:-1], greedy), temperature)
 
 
 def fixed_prompt(num_slots: int) -> PromptOptimizer:
