@@ -6,8 +6,7 @@ noise. An ablation is made for one world at a time: it runs or continues the tra
 adapts with UCB, prints the table and draws the learning curves. All its trainings have the same budget,
 which is smaller than that of the released policies and is stated above the table. Two ablations train
 nothing and use the released policy: ``table4`` adapts with UCB, and ``plan`` with our own optimizer, each
-time without one of its parts. ``all`` makes
-everything that is missing, and ``list`` shows what that is.
+time without one of its parts. ``all`` makes everything that is missing; ``list`` shows what that is.
 """
 
 from __future__ import annotations
