@@ -244,16 +244,21 @@ class GoalTransformer(nn.Module):
         self, cache: KVCache, action: Array, obs: Shaped[Array, "..."]
     ) -> tuple[Float[Array, "1 E"], KVCache]:
         """Append (a_{t-1}, o_t); returns the features at o_t and the longer cache."""
-        config, action = self.config, jnp.asarray(action)[None]
-        if config.tokens_per_step == 1:
-            time = jax.lax.dynamic_slice_in_dim(self.embed_time, cache.step, 1)
-            tokens = self._obs_token(obs[None], time) + self._embedded(action)
-        else:
-            times = jax.lax.dynamic_slice_in_dim(self.embed_time, cache.step - 1, 2)
-            pair = self._action_token(action, times[:1]), self._obs_token(obs[None], times[1:])
-            tokens = jnp.concatenate(pair)
-        at = config.max_prompt_length + config.num_step_tokens(cache.step)
+        tokens = self._new_tokens(cache.step, action, obs)
+        at = self.config.max_prompt_length + self.config.num_step_tokens(cache.step)
         return self._extend(self.norm_in(tokens), cache, at=at)
+
+    def _new_tokens(
+        self, step: Int[Array, ""], action: Array, obs: Shaped[Array, "..."]
+    ) -> Float[Array, "R E"]:
+        """The tokens that (a_{t-1}, o_t) adds to the sequence; o_t is in the last of them."""
+        action = jnp.asarray(action)[None]
+        if self.config.tokens_per_step == 1:
+            time = jax.lax.dynamic_slice_in_dim(self.embed_time, step, 1)
+            return self._obs_token(obs[None], time) + self._embedded(action)
+        times = jax.lax.dynamic_slice_in_dim(self.embed_time, step - 1, 2)
+        pair = self._action_token(action, times[:1]), self._obs_token(obs[None], times[1:])
+        return jnp.concatenate(pair)
 
     def _extend(
         self, x: Float[Array, "R E"], cache: KVCache, at: int | Int[Array, ""], keeps: bool = True

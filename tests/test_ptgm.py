@@ -79,17 +79,21 @@ def read(config, params, commands, obs, actions):
     return CommandedTransformer(config).apply(params, commands, obs, actions, method="read")
 
 
-@pytest.mark.parametrize("config", [CONFIG, SUMMED], ids=["two tokens", "one token"])
+@pytest.mark.parametrize(
+    "config",
+    [CONFIG, SUMMED, replace(CONFIG, joins_obs=False), replace(SUMMED, joins_obs=False)],
+    ids=["two tokens", "one token", "two tokens, goals alone", "one token, goals alone"],
+)
 def test_step_by_step_equals_the_full_pass(config, params, inputs):
     commands, obs, actions = inputs
     full = read(config, params, commands, obs, actions)
     network: Any = CommandedTransformer(config)
-    features, cache = network.apply(params, obs[0], method="begin")
-    cache = grow_cache(cache, 2 * T)
+    features, seen = network.apply(params, obs[0], method="begin")
+    seen = seen._replace(cache=grow_cache(seen.cache, 2 * T))
     for t in range(T):
         if t:
-            features, cache = network.apply(params, cache, actions[t - 1], obs[t], method="proceed")
-        found = network.apply(params, cache, commands[t], method="command")
+            features, seen = network.apply(params, seen, actions[t - 1], obs[t], method="proceed")
+        found = network.apply(params, seen, commands[t], method="command")
         np.testing.assert_allclose(found.logits, full.actions.logits[t], atol=1e-5)
         np.testing.assert_allclose(features, full.features[t], atol=1e-5)
         prior = network.apply(params, features, method="prior_logits")

@@ -4,9 +4,10 @@ The paper describes it as a slightly modified MGPO without a prompt, in which ev
 from hindsight relabeling, and adds a goal prior p(g | h_t, o_t), fitted by maximum likelihood. It does not
 say which goal is used for relabeling, nor how far ahead.
 
-Here the commanded goal is an additional token that attends to the history up to o_t, and whose output gives
-pi(a_t | g, h_t, o_t). No other token attends to it. The history therefore does not depend on earlier
-commands, and the key-value cache stays valid under every command. The output at o_t itself gives the prior.
+Here an observation with its goal is an additional token, which attends to the history up to o_t, and whose
+output gives pi(a_t | g, h_t, o_t). No other token attends to it. The history therefore does not depend on
+earlier commands, and the key-value cache stays valid under every command. The output at o_t itself, without
+a goal, gives the prior.
 """
 
 from __future__ import annotations
@@ -56,6 +57,10 @@ class CommandConfig(TransformerConfig):
     before the next decision continues as the demonstrators do."""
     skill_steps: Annotated[int, Ge(1), Le(10_000)] = 10
     """Number of steps between two decisions of the high level [10]."""
+    joins_obs: bool = False
+    """Whether the token of a command is the sum of the goal's embedding and the token of the observation,
+    so that it need not find the observation by attention. New networks have it; the released ones of mazes
+    and GridWorld are older, and their commands carry the goal and the timestep alone."""
 
     @property
     def goals(self) -> Float[Array, "N G"]:
@@ -72,6 +77,14 @@ class Reading(NamedTuple):
     """Logits of p(g | h_t, o_t)."""
     features: Float[Array, "T E"]
     """The outputs at the observations, which do not depend on commands."""
+
+
+class Read(NamedTuple):
+    """What the network has read so far."""
+
+    cache: KVCache
+    token: Float[Array, "*batch E"]
+    """The token of the last observation."""
 
 
 class CommandedTransformer(GoalTransformer):
@@ -97,36 +110,37 @@ class CommandedTransformer(GoalTransformer):
         slots, stride, time = self.config.max_prompt_length, self.config.tokens_per_step, len(obs)
         times = self.embed_time[:time]
         nothing = self._empty_prompt()
-        history = [self._prompt_tokens(nothing), self._step_tokens(obs, actions, times)]
-        queries = self.embed_goal(commands) + times
-        seen = self._seen(nothing, len(history[1]))
+        steps = self._step_tokens(obs, actions, times)
+        queries = self.embed_goal(commands) + (steps[::stride] if self.config.joins_obs else times)
+        seen = self._seen(nothing, len(steps))
         at_obs = np.arange(slots, len(seen), stride)
         reads = np.concatenate([at_obs, len(seen) + np.arange(time)])
         at = np.concatenate([np.arange(len(seen)), at_obs])
-        x = jnp.concatenate([*history, queries])
+        x = jnp.concatenate([self._prompt_tokens(nothing), steps, queries])
         out = self._full_pass(x, seen, at, reads, deterministic)
         features, commanded = out[: len(at_obs)], out[len(at_obs) :]
         return Reading(self.read_out(commanded), self.prior(features), features)
 
-    def begin(self, obs: Shaped[Array, "..."]) -> tuple[Float[Array, "E"], KVCache]:
-        """Read the first observation; returns the features there and the cache."""
+    def begin(self, obs: Shaped[Array, "..."]) -> tuple[Float[Array, "E"], Read]:
+        """Read the first observation; returns the features there and what was read."""
         features, cache = self._first(self._empty_prompt(), obs)
-        return features[-1], cache
+        return features[-1], Read(cache, self._obs_token(obs[None], self.embed_time[:1])[0])
 
     def proceed(
-        self, cache: KVCache, action: Array, obs: Shaped[Array, "..."]
-    ) -> tuple[Float[Array, "E"], KVCache]:
-        """Append (a_{t-1}, o_t); returns the features at o_t and the longer cache."""
-        features, cache = self._append(cache, action, obs)
-        return features[-1], cache
+        self, read: Read, action: Array, obs: Shaped[Array, "..."]
+    ) -> tuple[Float[Array, "E"], Read]:
+        """Append (a_{t-1}, o_t); returns the features at o_t and what was read with it."""
+        token = self._new_tokens(read.cache.step, action, obs)[-1]
+        features, cache = self._append(read.cache, action, obs)
+        return features[-1], Read(cache, token)
 
-    def command(self, cache: KVCache, goal: Float[Array, "G"]) -> Distribution:
+    def command(self, read: Read, goal: Float[Array, "G"]) -> Distribution:
         """pi(a_t | g, h_t, o_t) at the last observation that was read."""
-        last = cache.step - 1
-        time = jax.lax.dynamic_slice_in_dim(self.embed_time, last, 1)
-        query = self.norm_in(self.embed_goal(goal[None]) + time)
-        at = self.config.max_prompt_length + self.config.num_step_tokens(last + 1) - 1
-        features, _ = self._extend(query, cache, at, keeps=False)
+        config, last = self.config, read.cache.step - 1
+        time = jax.lax.dynamic_index_in_dim(self.embed_time, last, keepdims=False)
+        query = self.embed_goal(goal) + (read.token if config.joins_obs else time)
+        at = config.max_prompt_length + config.num_step_tokens(last + 1) - 1
+        features, _ = self._extend(self.norm_in(query)[None], read.cache, at, keeps=False)
         return self._distribution(features)
 
     def prior_logits(self, features: Float[Array, "E"]) -> Float[Array, "N"]:
@@ -246,25 +260,25 @@ def low_level(config: CommandConfig, params: Any, judged: Judgement) -> LowLevel
     def view(obs: Array, features: Array) -> View:
         return View(network.apply(params, obs, method="embedded"), features)
 
-    def begin(obs: Array) -> tuple[View, KVCache]:
-        features, cache = network.apply(params, obs, method="begin")
-        return view(obs, features), cache
+    def begin(obs: Array) -> tuple[View, Read]:
+        features, read = network.apply(params, obs, method="begin")
+        return view(obs, features), read
 
-    def proceed(cache: KVCache, action: Array, obs: Array) -> tuple[View, KVCache]:
-        features, cache = network.apply(params, cache, action, obs, method="proceed")
-        return view(obs, features), cache
+    def proceed(read: Read, action: Array, obs: Array) -> tuple[View, Read]:
+        features, read = network.apply(params, read, action, obs, method="proceed")
+        return view(obs, features), read
 
-    def command(cache: KVCache, decision: Int[Array, ""]) -> Float[Array, "G"]:
-        del cache
+    def command(read: Read, decision: Int[Array, ""]) -> Float[Array, "G"]:
+        del read
         return config.goals[decision]
 
-    def act_on(key: PRNGKeyArray, cache: KVCache, goal: Array, index: Int[Array, ""]) -> Array:
+    def act_on(key: PRNGKeyArray, read: Read, goal: Array, index: Int[Array, ""]) -> Array:
         del index
-        distribution = network.apply(params, cache, goal, method="command")
+        distribution = network.apply(params, read, goal, method="command")
         return act(key, distribution, greedy, temperature)
 
-    def grow(cache: KVCache, num_steps: int) -> KVCache:
-        return grow_cache(cache, config.tokens_per_step * num_steps)
+    def grow(read: Read, num_steps: int) -> Read:
+        return read._replace(cache=grow_cache(read.cache, config.tokens_per_step * num_steps))
 
     return LowLevel(begin, proceed, command, act_on, grow)
 
@@ -295,6 +309,7 @@ def complete(config: CommandConfig, env: Environment, dataset: Any) -> CommandCo
         config,
         commands=tuple(map(tuple, goals.tolist())),
         every_position=env.spec.truncate_in_hindsight,
+        joins_obs=True,
         max_prompt_length=1,  # the prompt stays empty
         prompt_order=False,
     )
