@@ -19,6 +19,7 @@ import pytest
 
 import envs
 from envs.errors import DataError, UsageError
+from envs.registry import Judgement
 from experiments import bench, layouts, measurements, signals
 from experiments.bench import BenchConfig, main
 from experiments.measurements import sequence_flops
@@ -85,8 +86,8 @@ def test_rows_of_baselines_are_per_episode_of_the_search(monkeypatch: pytest.Mon
     """A world that a method's check refuses, such as one without a list of goals, has no row of it."""
     asked = []
 
-    def adapt(env, policy, tasks, method, hyper, *, seeds, episodes, eval_every):
-        asked.append((policy, method.name, seeds, episodes, eval_every))
+    def adapt(env, policy, tasks, method, hyper, *, seeds, episodes, eval_every, judged):
+        asked.append((policy, method.name, seeds, episodes, eval_every, judged))
         if method.name == "ptgm":
             raise UsageError("no goals to choose from")
         returns = np.zeros((seeds, 4, episodes))
@@ -96,13 +97,15 @@ def test_rows_of_baselines_are_per_episode_of_the_search(monkeypatch: pytest.Mon
     monkeypatch.setattr(
         measurements, "policy_to_bench", lambda world, env, recipe, dataset: (recipe.method, "made")
     )
-    world, env = envs.find("gridworld"), envs.make("gridworld")
+    sampled = Judgement(mode="sample", temperature=0.5, episodes=16)
+    world, env = replace(envs.find("gridworld"), judged=sampled), envs.make("gridworld")
     rows = list(measurements.bench_baselines(world, env, "gridworld", None, 40))
     assert [row.name for row in rows] == ["adapt reinforce", "adapt ppo", "adapt spirl"]
     assert [row.value for row in rows] == [1e3 * 8 / 160] * 3
     assert rows[0].note == "made, 4 tasks x 40 episodes of 30 steps"
     assert [kind for kind, *_ in asked] == ["mgpo", "mgpo", "ptgm", "spirl"]
-    assert {tuple(rest) for _, _, *rest in asked} == {(1, 40, 40)}
+    # Judged as the world's record says, but in a single episode.
+    assert {tuple(rest) for _, _, *rest in asked} == {(1, 40, 40, replace(sampled, episodes=1))}
 
 
 @pytest.mark.parametrize("kind", ["rows", "layouts"])
