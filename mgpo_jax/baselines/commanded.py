@@ -59,8 +59,8 @@ class CommandConfig(TransformerConfig):
     """Number of steps between two decisions of the high level [10]."""
     joins_obs: bool = False
     """Whether the token of a command is the sum of the goal's embedding and the token of the observation,
-    so that it need not find the observation by attention. New networks have it; the released ones of mazes
-    and GridWorld are older, and their commands carry the goal and the timestep alone."""
+    so that it need not find the observation by attention. New networks have it; the released ones of mazes,
+    GridWorld and Kitchen are older, and their commands carry the goal and the timestep alone."""
 
     @property
     def goals(self) -> Float[Array, "N G"]:
