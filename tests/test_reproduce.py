@@ -515,7 +515,7 @@ def test_the_inventory_counts_prices_and_doubts(tmp_path: Path) -> None:
     )
     rest = 3 * (ppo + reinforce) / 2 + 2 * 3 * ptgm
     assert rest < float(larger[3]) < rest + 1
-    # Of PTGM nothing is published in Kitchen that tells a price.
+    # Of BC-finetune nothing is published in Kitchen that tells a price.
     assert re.fullmatch(r"\d+\.\d \+ \?", rows_of("kitchen")["table1"][3])
     spent = read_summary(Path("results/maze15/ucb"))["cpu_seconds"]
     assert rows["figure3"][1:3] == ["1 of 1", f"{spent / 60:.1f}"]
@@ -539,7 +539,7 @@ def test_prices_are_those_of_relatives() -> None:
     assert rate("maze15", methods.find("ucb")) == pytest.approx(ucb, rel=FOUR_DIGITS)
     similar = [rate("gridworld", methods.find(name)) for name in ("reinforce", "ppo")]
     assert rate("gridworld", methods.find("ppo-careful")) == pytest.approx(sum(similar) / 2)
-    assert rate("kitchen", methods.find("ptgm")) is None
+    assert rate("kitchen", methods.find("ppo")) is None
     cheapest = min(
         1 / read_summary(path)["episodes_per_cpu_second"]
         for path in Path("results/gridworld").iterdir()
