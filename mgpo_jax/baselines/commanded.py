@@ -137,10 +137,10 @@ class CommandedTransformer(GoalTransformer):
     def command(self, read: Read, goal: Float[Array, "G"]) -> Distribution:
         """pi(a_t | g, h_t, o_t) at the last observation that was read."""
         config, last = self.config, read.cache.step - 1
-        time = jax.lax.dynamic_index_in_dim(self.embed_time, last, keepdims=False)
-        query = self.embed_goal(goal) + (read.token if config.joins_obs else time)
+        time = jax.lax.dynamic_slice_in_dim(self.embed_time, last, 1)
+        query = self.embed_goal(goal[None]) + (read.token[None] if config.joins_obs else time)
         at = config.max_prompt_length + config.num_step_tokens(last + 1) - 1
-        features, _ = self._extend(self.norm_in(query)[None], read.cache, at, keeps=False)
+        features, _ = self._extend(self.norm_in(query), read.cache, at, keeps=False)
         return self._distribution(features)
 
     def prior_logits(self, features: Float[Array, "E"]) -> Float[Array, "N"]:
