@@ -27,7 +27,8 @@ def over_time(folder: Path) -> list[str]:
     """The cells of a run: its method and settings, its mean returns, and the paper's final return."""
     row = read_row(folder)
     method = row.summary["method"]
-    flags = [f"{flag(name)} {value}" for name, value in row.settings.items()]
+    others = {name: value for name, value in row.settings.items() if name != "eval_every"}
+    flags = [f"{flag(name)} {value}" for name, value in others.items()]
     one_seed = " (one seed)" if row.summary["num_seeds"] == 1 else ""
     with np.load(folder / "results.npz") as arrays:
         after, returns = arrays["eval_episodes"].tolist(), arrays["eval_returns"].astype(np.float64)
