@@ -237,14 +237,13 @@ class GoalTransformer(nn.Module):
 
         The cache must have room for the tokens of one more step (``grow_cache``).
         """
-        features, cache = self._append(cache, action, obs)
+        features, cache = self._append(cache, self._new_tokens(cache.step, action, obs))
         return self._distribution(features), cache
 
     def _append(
-        self, cache: KVCache, action: Array, obs: Shaped[Array, "..."]
+        self, cache: KVCache, tokens: Float[Array, "R E"]
     ) -> tuple[Float[Array, "1 E"], KVCache]:
-        """Append (a_{t-1}, o_t); returns the features at o_t and the longer cache."""
-        tokens = self._new_tokens(cache.step, action, obs)
+        """Append the tokens of (a_{t-1}, o_t); returns the features at o_t and the longer cache."""
         at = self.config.max_prompt_length + self.config.num_step_tokens(cache.step)
         return self._extend(self.norm_in(tokens), cache, at=at)
 

@@ -130,9 +130,9 @@ class CommandedTransformer(GoalTransformer):
         self, read: Read, action: Array, obs: Shaped[Array, "..."]
     ) -> tuple[Float[Array, "E"], Read]:
         """Append (a_{t-1}, o_t); returns the features at o_t and what was read with it."""
-        token = self._new_tokens(read.cache.step, action, obs)[-1]
-        features, cache = self._append(read.cache, action, obs)
-        return features[-1], Read(cache, token)
+        tokens = self._new_tokens(read.cache.step, action, obs)
+        features, cache = self._append(read.cache, tokens)
+        return features[-1], Read(cache, tokens[-1])
 
     def command(self, read: Read, goal: Float[Array, "G"]) -> Distribution:
         """pi(a_t | g, h_t, o_t) at the last observation that was read."""
